@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from bag_samples import scan, write_ros2_bag
 from cli_runner import error_line, run
+from conftest import REPOSITORY
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import DataError
@@ -18,7 +19,6 @@ from gp_ground_seg.data.inputs import list_inputs
 
 POINTS = scan()
 NAMES = ('x', 'y', 'z', 'intensity')
-MAP = (448_250.5, 5_411_900.25, 312.0)  # of a sensor, UTM [m]
 
 
 @pytest.fixture(scope='module')
@@ -74,38 +74,14 @@ def test_ground_and_obstacles_apart(source, expected):
 
 
 def test_the_ground_as_a_grid(tmp_path, expected):
-    cloud = cloud_of(
-        gather({name: POINTS[:, k].astype(float) + MAP[k] for k, name in enumerate('xyz')})
-    )
-    path = tmp_path / 'a.npy'
-    path.write_bytes(encode_file(path, cloud, {'label': expected.label}))
-    words = ('--origin', *MAP, '--surface')
-    assert run('segment', path, '-o', tmp_path / 'out.pcd', *words, '--quiet') == 0
+    np.save(tmp_path / 'a.npy', POINTS)
+    assert run('segment', tmp_path / 'a.npy', '-o', tmp_path / 'out.pcd', '--surface') == 0
     with np.load(tmp_path / 'out_surface.npz') as found:
-        x, y = found['x'] - MAP[0], found['y'] - MAP[1]
-        z, std = found['ground_z'], found['ground_std']
+        x, y, z, std = (found[name] for name in ('x', 'y', 'ground_z', 'ground_std'))
     expected_z, expected_std = GroundModel.of(expected).at(x, y[:, None])
     assert np.isfinite(expected_z).sum() > 1000
-    np.testing.assert_allclose(z - MAP[2], expected_z, atol=1e-3)
+    np.testing.assert_allclose(z, expected_z, atol=1e-4)
     np.testing.assert_allclose(std, expected_std, atol=1e-4)
-
-
-@pytest.mark.parametrize('suffix', ['.npy', '.bin'])
-def test_clouds_of_a_map_need_the_place_of_the_sensor(tmp_path, expected, capsys, suffix):
-    placed = POINTS[:, :3].astype(np.float64) + MAP
-    source, out = tmp_path / f'map{suffix}', tmp_path / 'out.npy'
-    placed.tofile(source) if suffix == '.bin' else np.save(source, placed)
-    layout = ('--columns', '3', '--dtype', 'float64') if suffix == '.bin' else ()
-    assert run('segment', source, '-o', out, *layout) == 2
-    line = error_line(capsys)
-    assert 'half of the points are farther than' in line
-    assert re.search(r'about 4482\d\d\.\d, 5411\d\d\d\.\d, .*; --origin X Y Z says where', line)
-    assert run('segment', source, '-o', out, *layout, '--origin', *MAP) == 0
-    found = np.load(out)
-    for k, name in enumerate('xyz'):
-        np.testing.assert_array_equal(found[name], placed[:, k])
-    assert np.mean(found['label'] != expected.label) < 0.005
-    np.testing.assert_allclose(found['ground_z'] - MAP[2], expected.ground_z, atol=0.01)
 
 
 def test_a_folder_of_several_formats(tmp_path, expected, capsys):
@@ -126,6 +102,16 @@ def test_a_folder_of_several_formats(tmp_path, expected, capsys):
         assert (tmp_path / 'pcd' / f'{name}_surface.npz').is_file()
     # nuScenes' fifth column, known by the name of the file.
     np.testing.assert_array_equal(found['column_5'], POINTS[:, 0])
+
+
+def test_the_page_says_how_to_read_a_text(tmp_path, monkeypatch, capsys, expected):
+    monkeypatch.chdir(tmp_path)
+    header = 'x,y,z,intensity'
+    np.savetxt('scan.csv', POINTS, delimiter=',', header=header, comments='')
+    files = (REPOSITORY / 'docs/api.md').read_text(encoding='utf-8').partition('## Files')[2]
+    exec(re.search('```python\n(.*?)```', files, re.DOTALL)[1])
+    assert capsys.readouterr().out == f'{expected.label}\n'
+    np.testing.assert_allclose(read_file(tmp_path / 'scan.npy').xyz, POINTS[:, :3])
 
 
 def test_output_beside_its_scan_is_no_scan(tmp_path, caplog):
@@ -204,15 +190,14 @@ def test_pictures_of_a_frame_of_a_bag_or_folder(tmp_path, capsys):
         (['a.npy', '--drop', '/a'], '--drop: is for bags'),
         (['a.npy', '--columns', '5'], '--columns: is for .bin scans, which a.npy is not'),
         (['a.npy', '-o', 'x.label', '--split'], '--split: is for clouds'),
-        (['a.npy', '-o', 'x.pcd', '--origin', 'nan', '0', '0'], 'must be three finite numbers'),
         (['drive.mcap', '--split'], '--split: is for scans'),
-        (['drive.mcap', '--origin', '1', '2', '3'], '--origin: is for scans'),
         (['drive.mcap', '--format', 'pcd', '--columns', '5'], '--columns: is for .bin scans'),
         (['wide.npy', '-o', 'x.ply'], 'field t: PLY has no type uint64'),
-        (['far.npy', '-o', 'x.pcd'], 'm (millimetres? a scan is in'),
-        (['none.npy', '-o', 'x.pcd'], 'none of 200 points is finite; --force'),
-        (['empty.npy', '-o', 'x.pcd'], 'no points in it; --force'),
-        (['names.csv', '-o', 'x.pcd'], 'names.csv: no points in it, only a line of names'),
+        (['far.npy', '-o', 'x.pcd'], 'are beyond 10 km, about'),
+        (['none.npy', '-o', 'x.pcd'], 'none of 200 points is finite'),
+        (['empty.npy', '-o', 'x.pcd'], 'no points in it'),
+        (['a.csv', '-o', 'x.pcd'], 'a.csv: a text of points: load it by numpy.loadtxt or pandas'),
+        (['texts', '-o', 'x'], 'folder; a.XYZ may be a text of points: load it by'),
     ],
 )  # fmt: skip
 def test_refused(tmp_path, monkeypatch, capsys, words, message):
@@ -228,7 +213,9 @@ def test_refused(tmp_path, monkeypatch, capsys, words, message):
     np.save('far.npy', 1000.0 * POINTS)
     np.save('none.npy', np.full((200, 3), np.nan))
     np.save('empty.npy', np.zeros((0, 3)))
-    (tmp_path / 'names.csv').write_text('a,b,c\n# no more\n\n')
+    (tmp_path / 'texts').mkdir()
+    for name in ('a.csv', 'texts/a.XYZ', 'texts/times.txt'):
+        (tmp_path / name).write_text('1 2 3\n')
     write_bag(tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
     assert run('segment', *words) == 2

@@ -248,14 +248,6 @@ def test_labels_into_one_file_and_settings_are_used(segmenter, tmp_path):
     assert np.count_nonzero(narrow == 40) < np.count_nonzero(written == 40)
 
 
-def test_a_scan_of_text_gives_arrays_beside_it(tmp_path):
-    points = np.fromfile(write_scans(tmp_path / 'velodyne') / '000000.bin', '<f4').reshape(-1, 4)
-    np.savetxt(tmp_path / 'scan.csv', points, delimiter=',')
-    assert segment(tmp_path / 'scan.csv', '--quiet') == 0
-    with np.load(tmp_path / 'scan_ground.npz') as arrays:
-        assert len(arrays['label']) == len(points)
-
-
 def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
     write_scans(tmp_path / 'velodyne', n_scans=2)
     out = tmp_path / 'labels'
@@ -284,7 +276,7 @@ def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
         (
             'empty',
             [],
-            r'empty: no \.bin, .*, \.xyz file in it \(\.txt and \.csv by name only\), and',
+            r'empty: no \.bin, .*, \.npz file in it, and not a rosbag2 folder$',
         ),
         ('root', ['--format', 'ply'], r'--format: whole data sets give \.label files and bags'),
         ('unfinished', [], r'no metadata\.yaml in it\); bag files in it.*: x_0\.mcap'),

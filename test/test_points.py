@@ -1,5 +1,8 @@
 import numpy as np
+import pytest
+from conftest import simulated
 
+from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.pipeline import points
 
 
@@ -21,3 +24,24 @@ def test_single_precision_keeps_finite_what_is():
     assert list(points.finite_points(single)) == [True, False, True]
     assert single[0, 1] > 3e38 and single[0, 2] < -3e38
     assert points.single_precision(single) is single
+
+
+def test_columns_for_rows_are_refused():
+    scan = simulated('flat', seed=1).points
+    for wrong in (scan.T, scan[:, :3].T, scan[:65].T):
+        with pytest.raises(PointCloudError, match=r'a point is a row; pass points\.T'):
+            points.take_points(wrong)
+    # Few points of many columns.
+    assert points.take_points(np.zeros((4, 64))).shape == (4, 3)
+
+
+@pytest.mark.parametrize(('share', 'is_refused'), [(0.0, False), (0.05, False), (0.2, True)])
+def test_points_farther_than_a_sensor_measures(share, is_refused):
+    scan = simulated('flat', seed=1).points[:, :3].astype(float)
+    for far in (10_001.0, -1e30, np.inf, np.nan):
+        placed = np.where(np.arange(len(scan))[:, None] % 100 < 100 * share, far, scan)
+        if is_refused and np.isfinite(far):
+            with pytest.raises(PointCloudError, match='20% of the points are beyond 10 km'):
+                points.take_points(placed)
+        else:
+            assert len(points.take_points(placed)) == len(scan)

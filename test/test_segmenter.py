@@ -72,7 +72,7 @@ def test_ground_and_boxes_are_told_apart(backend):
         np.full((7, 3), np.nan),
         np.full((7, 3), np.inf),
         np.zeros((5, 3)),
-        np.full((3, 3), 1e200),
+        np.concatenate([np.full((3, 3), 1e200), np.tile([[4.0, 1.0, -1.7]], (100, 1))]),
         np.tile([[4.0, 1.0, -1.7]], (100, 1)),
     ],
 )

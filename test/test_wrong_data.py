@@ -14,11 +14,12 @@ from evaluation_samples import write_frame
 
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, find_objection
+from gp_ground_seg.data.cloud_files import read_file
+from gp_ground_seg.data.scan_layout import find_objection
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
 
 SPARSE = 300 * 10**9
-DOUBLES = ('--dtype', 'float64')
+COLUMNS = ('--columns', '5')
 
 
 def missing(points, share, value):
@@ -36,17 +37,17 @@ GOOD = {
     'one point': lambda p: np.repeat(p[:1], len(p), axis=0),
     'flat': lambda p: p * np.float32([1, 1, 0, 1]),
 }
+FAR = r'\d+% of the points are beyond 10 km, about .*; scans are in metres'
 WRONG = {
-    'doubles': (lambda p: p.astype('<f8'), '% of the coordinates'),
+    'doubles': (lambda p: p.astype('<f8'), FAR),
     'rounded doubles': (
-        lambda p: np.round(256.0 * p.astype('<f8')) / 256.0, '% of the coordinates',
+        lambda p: np.round(256.0 * p.astype('<f8')) / 256.0, '% of the coordinates are below',
     ),
-    'millimetres': (
-        lambda p: p * np.float32([1000, 1000, 1000, 1]), r'farther than .* m \(millimetres\?',
-    ),
+    'millimetres': (lambda p: p * np.float32([1000, 1000, 1000, 1]), FAR),
+    'a map': (lambda p: p + np.float32([448_250.5, 5_411_900.25, 312.0, 0]), FAR),
     'labels': (
         lambda p: np.where(p[:, 2] < 0, 40, 10 + (7 << 16)).astype('<u4').repeat(4),
-        '100% of the coordinates',
+        '100% of the coordinates are below',
     ),
     'NaN': (lambda p: np.full_like(p, np.nan), 'points is finite'),
     'no point': (lambda p: p[:0], 'no points in it'),
@@ -69,40 +70,68 @@ def test_good_scans_are_not_doubted(scans, change):
 
 
 @pytest.mark.parametrize('change', WRONG)
-def test_wrong_data_are_refused_in_a_line_that_names_the_options(scans, tmp_path, change):
+def test_wrong_data_are_refused_in_a_line_that_names_the_option(scans, tmp_path, change):
     make, problem = WRONG[change]
-    layout, path = ScanLayout(doubts='raise'), tmp_path / 'a.bin'
+    path = tmp_path / 'a.bin'
     for points in scans:
         path.write_bytes(make(points).tobytes())
         with pytest.raises(DataError, match=problem) as caught:
-            read_points(path, layout)
+            read_points(path)
         assert str(caught.value).startswith(f'{path}: ')
-        advice = 'read as 4 columns of float32: --columns and --dtype choose another layout'
-        assert str(caught.value).endswith(f'{advice}; --force takes it as it is')
+        assert str(caught.value).endswith('; a .bin holds float32: --columns chooses their number')
 
 
-def test_the_library_reads_what_it_is_told(tmp_path):
+def test_the_line_for_a_map_can_be_followed(tmp_path):
+    points, place = simulated('urban', seed=1).points[:, :3], (448_250.5, 5_411_900.25, 312.0)
+    np.save(tmp_path / 'map.npy', points.astype(float) + place)
+    with pytest.raises(DataError, match=r'km, about 4482\d.*, 54119\d.*; scans') as caught:
+        read_file(tmp_path / 'map.npy')
+    line = str(caught.value).partition('as in ')[2].replace('near.npy', f'{tmp_path}/near.npy')
+    given = {'numpy': np, 'points': np.load(tmp_path / 'map.npy')}
+    exec(line.replace('(X, Y, Z)', str(place)), given)
+    np.testing.assert_allclose(read_file(tmp_path / 'near.npy').xyz, points, atol=1e-5)
+
+
+@pytest.mark.parametrize('columns', [3, 4, 5, 6])
+def test_another_number_of_columns_is_seen_by_the_distances(scans, tmp_path, columns):
+    """Read as it is never refused, with another number named, or at least not praised."""
+    path, rng = tmp_path / 'a.bin', np.random.default_rng(1)
+    n_named = n_wrong = 0
+    for points in scans:
+        points = points[: len(points) // 840 * 840]
+        more = rng.uniform(0.0, 60.0, (len(points), 3)), np.zeros((len(points), 3))
+        for extra in more:
+            np.hstack([points[:, :3], extra])[:, :columns].astype('<f4').tofile(path)
+            assert len(read_points(path, columns)) == len(points)
+            for wrong in {3, 4, 5, 6} - {columns, 2 * columns}:
+                n_wrong += 1
+                try:
+                    read_points(path, wrong)
+                except DataError as error:
+                    n_named += f'use --columns {columns}' in str(error)
+    assert n_named >= 0.9 * n_wrong
+
+
+def test_columns_that_are_asked_for_are_read(tmp_path):
     points, path = simulated('urban', seed=1).points, tmp_path / 'a.bin'
-    for n_columns, dtype in ((3, '<f4'), (4, '<f4'), (5, '<f4'), (4, '<f8'), (7, '<f8')):
-        table = np.zeros((len(points), n_columns), dtype)
+    for n_columns in (3, 4, 5, 7):
+        table = np.zeros((len(points), n_columns), '<f4')
         table[:, :4] = points[:, :n_columns]
         table.tofile(path)
-        read = read_points(path, ScanLayout(n_columns, np.dtype(dtype).name, 'raise'))
+        read = read_points(path, n_columns)
         assert (read.dtype, read.flags.writeable) == (np.float32, True)
         expected = points * np.float32([1, 1, 1, n_columns > 3])
         np.testing.assert_array_equal(read, expected)
-    # Without a command nothing is judged.
-    np.full_like(points, np.nan).tofile(path)
-    assert len(read_points(path, KITTI)) == len(points)
 
 
 @pytest.fixture
 def root(tmp_path):
-    """A SemanticKITTI folder with two sequences of one frame of doubles, labelled."""
+    """A SemanticKITTI folder with two sequences of one frame of five columns, labelled."""
     points = simulated('urban', 'hdl-32e', 1).points
+    points = np.hstack([points, points[:, 3:]])[: len(points) // 20 * 20]
     semantic = np.where(points[:, 2] < -1.5, 40, 10).astype('<u4')
     for sequence in ('00', '01'):
-        write_frame(tmp_path / 'root', sequence, 0, points.astype('<f8'), semantic)
+        write_frame(tmp_path / 'root', sequence, 0, points, semantic)
     return tmp_path / 'root'
 
 
@@ -137,22 +166,16 @@ def test_every_command_refuses_wrong_data_and_names_the_option(command, root, ca
     assert run(*words_of(command, root)) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith('gp-ground-seg: error: ')
-    assert re.search(r'000000\.bin: \d+% of the coordinates are .*; read as 4 columns of', line)
-    assert '--columns and --dtype choose another layout; --force takes it' in line
+    assert re.search(r'000000\.bin: read with 4 columns .*: use --columns 5$', line)
     assert what_is_there(root) == ['root']
 
 
 @pytest.mark.parametrize('command', ['segment', 'segment folder', 'plot scan'])
-def test_the_option_helps_and_force_takes_it_with_a_note(command, root, capsys):
+def test_the_option_helps_and_force_does_not(command, root, capsys):
     words = words_of(command, root)
-    assert run(*words, *DOUBLES) == 0
-    right = capsys.readouterr()
-    assert 'read as' not in right.err
-    assert run(*words, '--force') == 0
-    forced = capsys.readouterr()
-    (note,) = [line for line in forced.err.splitlines() if 'note: ' in line and 'read as' in line]
-    assert note.endswith('--columns and --dtype choose another layout')
-    assert forced.out != right.out
+    assert run(*words, '--force') == 2
+    assert 'use --columns 5' in error_line(capsys)
+    assert run(*words, *COLUMNS) == 0
 
 
 @pytest.mark.parametrize(
@@ -164,14 +187,13 @@ def test_the_option_helps_and_force_takes_it_with_a_note(command, root, capsys):
         ('demo --output OUT', 'a simulated one'),
     ],
 )
-def test_a_layout_is_for_files_of_scans(tmp_path, monkeypatch, capsys, words, what):
+def test_columns_are_for_files_of_scans(tmp_path, monkeypatch, capsys, words, what):
     monkeypatch.chdir(tmp_path)
     write_ros2_bag(tmp_path / 'a.mcap')
     named = words.replace('BAG', 'a.mcap').split()
-    for option, value in (DOUBLES, ('--columns', '5')):
-        assert run(*named, option, value) == 2
-        said = f'{option}: is for .bin scans, which {what.replace("BAG", "a.mcap")} is not'
-        assert error_line(capsys) == said
+    assert run(*named, *COLUMNS) == 2
+    said = f'--columns: is for .bin scans, which {what.replace("BAG", "a.mcap")} is not'
+    assert error_line(capsys) == said
     assert what_is_there(tmp_path / 'a.mcap') == ['a.mcap']
 
 
@@ -190,7 +212,7 @@ def test_other_huge_files_are_refused_by_their_size(root, tmp_path, capsys):
     scan, label, times = (
         folder / name for name in ('velodyne/000000.bin', 'labels/000000.label', 'times.txt')
     )
-    n_points, yaml = scan.stat().st_size // 32, tmp_path / 'huge.yaml'
+    n_points, yaml = scan.stat().st_size // 20, tmp_path / 'huge.yaml'
     for path in (label, times, yaml):
         path.touch()
     os.truncate(label, SPARSE)
@@ -200,18 +222,18 @@ def test_other_huge_files_are_refused_by_their_size(root, tmp_path, capsys):
         ['kitti-to-bag', root, '--sequence', '00', tmp_path / 'a.mcap'],
     ):
         times.unlink(missing_ok=True)
-        assert run(*words, *DOUBLES) == 2
+        assert run(*words, *COLUMNS) == 2
         said = f'{SPARSE} bytes, expected {4 * n_points} for {n_points} points'
         assert error_line(capsys) == f'{label}: {said}'
     times.touch()
     os.truncate(times, SPARSE)
-    assert run('evaluate', root, *DOUBLES) == 2
+    assert run('evaluate', root, *COLUMNS) == 2
     assert error_line(capsys).startswith(f'{times}: {SPARSE} bytes, accepted are at most ')
     os.truncate(yaml, SPARSE)
     said = f'{yaml}: too large for a parameter file, accepted are {1 << 18} bytes'
     assert run('config', 'check', yaml) == 2
     assert capsys.readouterr().err.splitlines() == [said]
-    assert run('segment', scan, *DOUBLES, '--config', yaml, '-o', tmp_path / 'a.label') == 2
+    assert run('segment', scan, *COLUMNS, '--config', yaml, '-o', tmp_path / 'a.label') == 2
     assert error_line(capsys) == said
     with pytest.raises(DataError, match='bytes, expected 4 for 1 points'):
         read_labels('/dev/zero', 1)
@@ -235,7 +257,7 @@ def test_the_options_are_those_of_every_command_that_reads_scans(capsys):
         with pytest.raises(SystemExit, match='0'):
             cli.main([*words, '--help'])
         text = capsys.readouterr().out
-        assert all(option in text for option in ('--columns N', '--dtype {', '--force'))
+        assert '--columns N' in text
     for wrong in ('2', '-1', 'x'):
         with pytest.raises(SystemExit, match='2'):
             cli.main(['segment', 'a.bin', '--columns', wrong])

@@ -73,7 +73,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('root', 'folder with sequences/ in it', {'metavar': 'ROOT'}),
         ('output', 'folder, .mcap or .db3 file to write', {'metavar': 'OUT'}),
         ('--sequence', 'sequence, as in 00', {'metavar': 'S', 'required': True}),
-        *options.SCAN_LAYOUT,
+        options.COLUMNS,
         options.FORCE,
         options.QUIET,
     )
@@ -105,8 +105,8 @@ def scan_cloud(
 
 def run_convert(arguments: argparse.Namespace) -> int:
     """Write the bag."""
-    layout = options.scan_layout(arguments)
-    frames = list_frames(arguments.root, arguments.sequence, layout)
+    columns = options.columns_of(arguments)
+    frames = list_frames(arguments.root, arguments.sequence, columns)
     stamps = [_nanoseconds(frame) for frame in frames]
     target = Path(arguments.output)
     options.note_leftovers(target, quiet=arguments.quiet)
@@ -117,7 +117,7 @@ def run_convert(arguments: argparse.Namespace) -> int:
     ):
         bag.add_topic(cloud_topic(TOPIC))
         for frame, stamp in zip(frames, stamps, strict=True):
-            points = read_points(frame.points_path, frame.layout)
+            points = read_points(frame.points_path, frame.columns)
             labels = {}
             if frame.labels_path is not None:
                 labels['label'] = read_labels(frame.labels_path, len(points)).astype(np.uint32)

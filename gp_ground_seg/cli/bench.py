@@ -12,7 +12,7 @@ import numpy as np
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, MissingDependencyError, shown
 from gp_ground_seg.data.inputs import holds_bag, list_inputs
-from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
+from gp_ground_seg.data.scan_layout import KITTI_COLUMNS
 from gp_ground_seg.data.semantic_kitti import list_sequences
 from gp_ground_seg.lab.scoring import report
 from gp_ground_seg.lab.scoring.benchmark import bench_cases, bench_document, run_cases
@@ -52,7 +52,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--from', 'show what --json wrote, measure nothing', {**file, 'dest': 'record'}),
         ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
         ('--numpy', 'time both without compiled code as well', options.FLAG),
-        *options.SCAN_LAYOUT,
+        options.COLUMNS,
         options.TO_JSON,
         options.FORCE,
     )  # fmt: skip
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise DataError('bench: name either DATA to measure on or --from FILE')
     given = arguments.record
     if given is not None:
-        options.refuse_scan_layout(arguments, given)
+        options.refuse_columns(arguments, given)
     with options.staged_options(arguments, 'json') as parts:
         document = _measure(arguments) if given is None else read_record(given)
         if 'json' in parts:
@@ -96,9 +96,9 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
         baseline = None
     source = Path(arguments.data)
     if holds_bag(source):
-        options.refuse_scan_layout(arguments, source)
-    layout = options.scan_layout(arguments)
-    frames = load_frames(source, arguments.frames, arguments.topic, layout)
+        options.refuse_columns(arguments, source)
+    columns = options.columns_of(arguments)
+    frames = load_frames(source, arguments.frames, arguments.topic, columns)
     cases = bench_cases(config, with_numpy=arguments.numpy)
     make_baseline = PatchworkppMethod if baseline else None
     with options.runner(arguments, 'bench') as runner:
@@ -108,7 +108,7 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def load_frames(
-    source: Path, n_frames: int, topic: str | None = None, layout: ScanLayout = KITTI
+    source: Path, n_frames: int, topic: str | None = None, columns: int = KITTI_COLUMNS
 ) -> list[KnownScan]:
     """Read about `n_frames` frames of DATA; DataError if there is no point in any."""
     if topic is None and any(source.glob('sequences/*/velodyne')):
@@ -117,7 +117,7 @@ def load_frames(
         folders = {source.stem: source}
     frames = []
     for j, (name, folder) in enumerate(folders.items()):
-        inputs = list_inputs(folder, layout, topic)
+        inputs = list_inputs(folder, columns, topic)
         # Shares of whole frames that add up to those wanted.
         share = n_frames * (j + 1) // len(folders) - n_frames * j // len(folders)
         wanted = {k: run_name for run_name, k in runs(inputs.topic or name, len(inputs), share)}

@@ -6,7 +6,6 @@ import argparse
 import statistics
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -37,17 +36,17 @@ def _is_root(source: str) -> bool:
 
 def list_scans(arguments: argparse.Namespace) -> list[Scan]:
     """List the scans of the input; of a SemanticKITTI root, output goes into the same folders."""
-    layout = options.scan_layout(arguments)
+    columns = options.columns_of(arguments)
     if not _is_root(arguments.input):
-        found = list_inputs(arguments.input, layout)
+        found = list_inputs(arguments.input, columns)
         return [Scan(item.path, f'{item.name}.label', partial(_read, item)) for item in found]
     names = list_sequences(arguments.input)
-    frames = [frame for name in names for frame in list_frames(arguments.input, name, layout)]
+    frames = [frame for name in names for frame in list_frames(arguments.input, name, columns)]
     return [
         Scan(
             frame.points_path,
             f'sequences/{frame.sequence}/predictions/{frame.index}.label',
-            partial(read_points, frame.points_path, layout),
+            partial(read_points, frame.points_path, columns),
         )
         for frame in frames
     ]
@@ -86,11 +85,11 @@ def run(
         raise DataError(f'{target}: must be a folder')
     if not target.resolve().parent.is_dir():
         raise DataError(f'{target}: the folder {target.resolve().parent} does not exist')
-    layout = replace(options.scan_layout(arguments), doubts='ignore')
+    columns = options.columns_of(arguments)
     given = [getattr(arguments, name) for name in _OPTIONS]
     # A bag takes long: each is a block by itself, and kept once it is finished.
     group = attrgetter('name') if unit == 'bag' else None
-    manifest = Manifest(target, digest(config, layout, given), items)
+    manifest = Manifest(target, digest(config, columns, given), items)
     with closing(manifest):
         done, again = manifest.open(resume=arguments.resume, force=arguments.force)
         if done or again:

@@ -18,7 +18,6 @@ from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.atomic_output import staged_files
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, read_xyz
-from gp_ground_seg.data.scan_layout import ScanLayout
 from gp_ground_seg.data.semantic_kitti import (
     labelled_frames,
     list_sequences,
@@ -86,7 +85,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--sequence', 'sequence of it, as in 00 (default: the first)', {'metavar': 'S'}),
         ('--frames', 'scans to play, at most (default: %(default)s)',
          {**options.NUMBER, 'default': 30}),
-        *options.SCAN_LAYOUT,
+        options.COLUMNS,
         ('--rate', rate, {'metavar': 'HZ', 'type': options.above_zero}),
         ('--output', 'folder for what is written (default: %(default)s)',
          {'metavar': 'DIR', 'default': 'demo_output'}),
@@ -115,13 +114,13 @@ def simulated_drive(n_frames: int) -> Drive:
     return Drive('Simulated street', 'the truth, which the simulator knows', n_frames, labelled)
 
 
-def kitti_drive(root: str | Path, sequence: str, n_frames: int, layout: ScanLayout) -> Drive:
+def kitti_drive(root: str | Path, sequence: str, n_frames: int, columns: int) -> Drive:
     """Return the first labelled scans of a KITTI sequence; raise a DataError if it has none."""
-    frames = labelled_frames(root, [sequence], layout)[:n_frames]
+    frames = labelled_frames(root, [sequence], columns)[:n_frames]
 
     def scans() -> Iterator[Scan]:
         for frame in frames:
-            points = read_points(frame.points_path, frame.layout)
+            points = read_points(frame.points_path, frame.columns)
             assert frame.labels_path is not None, 'labelled_frames gives only labelled ones'
             yield points, read_labels(frame.labels_path, len(points)), frame.time
 
@@ -218,12 +217,12 @@ def run(arguments: argparse.Namespace) -> int:
     sequence = arguments.sequence
     if arguments.kitti is not None:
         sequence = sequence or list_sequences(arguments.kitti)[0]
-        layout = options.scan_layout(arguments)
-        drive = kitti_drive(arguments.kitti, sequence, arguments.frames, layout)
+        columns = options.columns_of(arguments)
+        drive = kitti_drive(arguments.kitti, sequence, arguments.frames, columns)
     elif sequence is not None:
         raise DataError(f'--sequence {sequence}: goes with --kitti ROOT')
     else:
-        options.refuse_scan_layout(arguments, 'a simulated one')
+        options.refuse_columns(arguments, 'a simulated one')
         drive = simulated_drive(arguments.frames)
     folder = Path(arguments.output)
     options.note_leftovers(folder)

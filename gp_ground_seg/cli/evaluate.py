@@ -68,7 +68,7 @@ ROOT = ('root', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'})
 OF_FRAMES = (
     ('--sequences', 'sequences, as in 00,08 (default: all)', {'metavar': 'LIST'}),
     ('--frame-step', 'every Nth frame of a sequence only', options.NUMBER),
-    *options.SCAN_LAYOUT,
+    options.COLUMNS,
 )
 
 
@@ -166,7 +166,7 @@ def _items(
         if getattr(arguments, name) is not None:
             option = name.replace('_', '-')
             raise DataError(f'--{option}: {root} has no sequences/*/velodyne below it')
-    inputs = list_inputs(root, options.scan_layout(arguments))
+    inputs = list_inputs(root, options.columns_of(arguments))
     return inputs, partial(_load_cloud, inputs.path.stem)
 
 
@@ -197,6 +197,6 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
     """Labelled frames of the options, grouped by sequence."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]
-    frames = labelled_frames(arguments.root, chosen, options.scan_layout(arguments))
+    frames = labelled_frames(arguments.root, chosen, options.columns_of(arguments))
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
     return [frame for _, group in groups for frame in [*group][:: arguments.frame_step or 1]]

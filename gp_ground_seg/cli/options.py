@@ -22,12 +22,12 @@ from gp_ground_seg.core.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.core.parameters.schema import load_yaml
 from gp_ground_seg.data.atomic_output import leftovers, staged_file
 from gp_ground_seg.data.inputs import Inputs, list_inputs
-from gp_ground_seg.data.scan_layout import DTYPES, KITTI, MIN_COLUMNS, ScanLayout
+from gp_ground_seg.data.scan_layout import KITTI_COLUMNS, MIN_COLUMNS
 from gp_ground_seg.lab.scale.cluster import Runner, open_runner
 
 DEFAULT_PRESET = 'default'
 FLAG = {'action': 'store_true'}
-FORCE = ('--force', 'replace existing output; read files that do not look like scans', FLAG)
+FORCE = ('--force', 'replace existing output', FLAG)
 MARKDOWN = ('--markdown', 'print the tables as Markdown', FLAG)
 QUIET = ('--quiet', 'no progress bar, no notes', FLAG)
 TO_JSON = ('--json', 'write every number to this file as well', {'metavar': 'FILE'})
@@ -66,49 +66,40 @@ def positive(word: str, least: int = 1) -> int:
 NUMBER: dict[str, Any] = {'metavar': 'N', 'type': positive}
 
 
-SCAN_LAYOUT: tuple[tuple[str, str, dict[str, Any]], ...] = (
-    ('--columns', f'numbers per point of a .bin scan, x y z first (default: {KITTI.columns})',
-     {'metavar': 'N', 'type': partial(positive, least=MIN_COLUMNS)}),
-    ('--dtype', f'type of these numbers (default: {KITTI.dtype})', {'choices': DTYPES}),
+COLUMNS: tuple[str, str, dict[str, Any]] = (
+    '--columns', f'numbers per point of a .bin scan, x y z first (default: {KITTI_COLUMNS})',
+    {'metavar': 'N', 'type': partial(positive, least=MIN_COLUMNS)},
 )  # fmt: skip
-"""Options of every command that reads ``.bin`` scans; it takes `FORCE` as well."""
+"""Option of every command that reads ``.bin`` scans."""
 
 
 CLOUDS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
-    ('--origin', 'place of the sensor in clouds in the coordinates of a map [m]',
-     {'metavar': ('X', 'Y', 'Z'), 'nargs': 3, 'type': float}),
-    *SCAN_LAYOUT,
-)  # fmt: skip
-"""Options of every command that reads clouds of any format; it takes `FORCE` as well."""
+    COLUMNS,
+)
+"""Options of every command that reads clouds of any format."""
 
 
 def list_clouds(arguments: argparse.Namespace) -> Inputs:
     """Return the clouds of the input; DataError if ``--frame`` is none of them."""
-    found = list_inputs(arguments.input, scan_layout(arguments), arguments.topic)
+    found = list_inputs(arguments.input, columns_of(arguments), arguments.topic)
     if found.topic is not None or not any(scan.path.suffix == '.bin' for scan in found):
-        refuse_scan_layout(arguments, arguments.input)
+        refuse_columns(arguments, arguments.input)
     frame = getattr(arguments, 'frame', None)
     if frame is not None and not 0 <= frame < len(found):
         raise DataError(f'--frame {frame}: must be 0 to {len(found) - 1} here')
     return found
 
 
-def scan_layout(arguments: argparse.Namespace) -> ScanLayout:
-    """Return how scans are read: without ``--force`` those that can be no scan are refused."""
-    doubts = 'warn' if arguments.force else 'raise'
-    columns, dtype = arguments.columns or KITTI.columns, arguments.dtype or KITTI.dtype
-    origin = getattr(arguments, 'origin', None)
-    if origin is not None and not all(map(math.isfinite, origin)):
-        raise DataError(f'--origin {" ".join(map(str, origin))}: must be three finite numbers')
-    return ScanLayout(columns, dtype, doubts, origin and tuple(origin))
+def columns_of(arguments: argparse.Namespace) -> int:
+    """Return the numbers of a point in ``.bin`` scans."""
+    return int(arguments.columns or KITTI_COLUMNS)
 
 
-def refuse_scan_layout(arguments: argparse.Namespace, source: object) -> None:
-    """Raise a DataError if a layout is given, but `source` is no ``.bin`` scan."""
-    for name in ('columns', 'dtype'):
-        if getattr(arguments, name) is not None:
-            raise DataError(f'--{name}: is for .bin scans, which {source} is not')
+def refuse_columns(arguments: argparse.Namespace, source: object) -> None:
+    """Raise a DataError if ``--columns`` is given, but `source` is no ``.bin`` scan."""
+    if arguments.columns is not None:
+        raise DataError(f'--columns: is for .bin scans, which {source} is not')
 
 
 def add_cluster(parser: argparse._ActionsContainer) -> None:

@@ -24,7 +24,7 @@ from gp_ground_seg.lab.scale.dataset import Outcome, Scan, pool, segment_block
 DESCRIPTION = """\
 Split scans into ground and obstacles.
 
-INPUT is a scan (.bin .pcd .ply .npy .npz .xyz .txt .csv), a folder or sequence of scans, a bag
+INPUT is a scan (.bin .pcd .ply .npy .npz), a folder or sequence of scans, a bag
 (.bag .mcap .db3, or a rosbag2 folder), several bags, or a KITTI_ROOT. docs/datasets.md has more
 on formats, and on whole data sets.
 
@@ -45,7 +45,7 @@ EXAMPLES = """\
 """
 
 FOR_BAGS: tuple[str, ...] = ('ground_topic', 'obstacles_topic', 'drop')
-FOR_SCANS: tuple[str, ...] = ('split', 'surface', 'origin')
+FOR_SCANS: tuple[str, ...] = ('split', 'surface')
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
             option = name.replace('_', '-')
             raise DataError(f'--{option}: is for {kind}, which {source} is not')
     if is_bag:
-        options.refuse_scan_layout(arguments, source)
+        options.refuse_columns(arguments, source)
     if dataset.is_dataset(arguments):
         _segment_dataset(arguments, config, is_bag)
         return 0

@@ -1,7 +1,6 @@
 """Point clouds in files, their format known by the suffix; those of numpy are read here.
 
 ``.npy`` is one table or structured array, ``.npz`` has an array for each field, or one table.
-``.xyz``, ``.txt`` and ``.csv`` have a line for each point, and may have one with the names before.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ import io
 import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,6 @@ import numpy as np
 
 from gp_ground_seg.core.errors import DataError, GroundSegError, PointCloudError, in_one_line
 from gp_ground_seg.data.clouds import (
-    COLUMNS,
     Cloud,
     Columns,
     Fields,
@@ -32,11 +29,10 @@ from gp_ground_seg.data.clouds import (
 from gp_ground_seg.data.files import MAX_SCAN_BYTES, read_bytes
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
-from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, check_scan, four_columns, read_scan
+from gp_ground_seg.data.scan_layout import KITTI_COLUMNS, check_scan, four_columns, read_scan
 
 NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
 TABLE = 'points'  # array of an .npz that is a table (N, >= 3), beside fields (N,)
-COMMENTS = ('#', '//')  # begin lines of a text that are no points
 
 
 def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
@@ -72,37 +68,6 @@ def _table_name(arrays: Columns) -> str:
     return tables[0]
 
 
-def _read_text(data: bytes) -> tuple[Fields, None]:
-    """Read lines of x, y, z, ..., split by spaces, commas or semicolons; names may be first."""
-    text = data.decode('utf-8-sig')
-    stripped = (line.strip() for line in io.StringIO(text))
-    lines = (line for line in stripped if line and not line.startswith(COMMENTS))
-    first = next(lines, '')
-    delimiter = next((mark for mark in ',;' if mark in first), None)
-    words = [word.strip(' "') for word in first.split(delimiter)]
-    check_numbers(len(words))
-    if not first:
-        raise PointCloudError('no line of numbers in it')
-    before = 0 if all(map(_is_number, words)) else text.partition(first)[0].count('\n') + 1
-    if before and next(lines, None) is None:
-        raise PointCloudError('no points in it, only a line of names')
-    table = np.loadtxt(
-        io.StringIO(text), delimiter=delimiter, comments=COMMENTS, skiprows=before, ndmin=2
-    )
-    if not before:
-        return _fields_of({TABLE: table})[0], None
-    names = [word.lower() if word.lower() in COLUMNS else word for word in words]
-    return gather(dict(zip(names, table.T, strict=True))), None
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
 def _encode_npy(cloud: Cloud) -> bytes:
     """File of a structured array."""
     file = io.BytesIO()
@@ -129,38 +94,38 @@ _READERS: dict[str, Callable[[bytes], tuple[Fields, Any]]] = {
     '.ply': read_ply,
     '.npy': _read_numpy,
     '.npz': _read_numpy,
-    '.xyz': _read_text,
-    '.txt': _read_text,
-    '.csv': _read_text,
 }
 _ENCODERS = {'.pcd': encode_pcd, '.ply': encode_ply, '.npy': _encode_npy, '.npz': _encode_npz}
 SUFFIXES = ('.bin', *_READERS)
 WRITABLE = tuple(_ENCODERS)
+TEXT_SUFFIXES = ('.xyz', '.txt', '.csv')
+"""Files of text, whose columns nobody knows but their author."""
+FROM_TEXT = 'a text of points: load it by numpy.loadtxt or pandas.read_csv, save x y z as .npy'
 
 
-def read_file(path: Path, layout: ScanLayout = KITTI) -> Cloud:
-    """Read a file; `layout` is that of ``.bin`` files, says what to do in doubt, and the origin.
+def read_file(path: Path, columns: int = KITTI_COLUMNS) -> Cloud:
+    """Read a file; `columns` are the numbers of a point in a ``.bin``.
 
-    Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, or, where the layout
-    asks for that, can be no scan. nuScenes' ``.pcd.bin`` is known by its name.
+    Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, or can be no scan.
+    nuScenes' ``.pcd.bin`` is known by its name.
     """
     suffix = path.suffix.lower()
     if suffix == '.bin':
-        if path.name.endswith(NUSCENES_SUFFIX) and layout.columns == KITTI.columns:
-            layout = replace(layout, columns=NUSCENES_COLUMNS)
-        table = read_scan(path, layout)
-        # Coordinates of a map need their double precision until the origin is subtracted.
-        xyz = four_columns(table) if layout.origin is None else table
-        cloud = Cloud(name_columns(table), xyz)
-    else:
-        data = read_bytes(path, MAX_SCAN_BYTES)
-        with _named(path, 'cannot be read'), np.errstate(all='ignore'):
-            fields, header = _READERS[suffix](data)
-            check_numbers(count_numbers(fields.dtype))
-            cloud = cloud_of(fields, header)
-    cloud = cloud.about(layout.origin)
-    check_scan(path, cloud.xyz[:, :3], layout)
+        if path.name.endswith(NUSCENES_SUFFIX) and columns == KITTI_COLUMNS:
+            columns = NUSCENES_COLUMNS
+        table = read_scan(path, columns)
+        return Cloud(name_columns(table), four_columns(table))
+    cloud = decode_file(path, read_bytes(path, MAX_SCAN_BYTES))
+    check_scan(path, cloud.xyz)
     return cloud
+
+
+def decode_file(path: Path, data: bytes) -> Cloud:
+    """Cloud of the data of a file, of the format of `path`; DataError if it cannot be read."""
+    with _named(path, 'cannot be read'), np.errstate(all='ignore'):
+        fields, header = _READERS[path.suffix.lower()](data)
+        check_numbers(count_numbers(fields.dtype))
+        return cloud_of(fields, header)
 
 
 def encode_file(path: Path, cloud: Cloud, columns: Columns) -> bytes:

@@ -115,7 +115,7 @@ def _results(result: Segmentation, cloud: Cloud) -> Columns:
     """Label and values of each point, in the coordinates of the file."""
     values: Columns = {
         'height': result.height,
-        'ground_z': result.ground_z + cloud.origin[2],
+        'ground_z': result.ground_z,
         'ground_std': result.ground_std,
         'p_ground': result.p_ground,
     }
@@ -134,6 +134,5 @@ def _encode_surface(result: Segmentation, cloud: Cloud) -> bytes:
     reach = CELL * np.ceil(model.knots[-1] / CELL)
     middle = np.arange(0.5 * CELL - reach, reach, CELL)
     z, std = model.at(middle, middle[:, None])
-    x, y, height = cloud.origin
-    grids = {'ground_z': (z + height).astype(np.float32), 'ground_std': std.astype(np.float32)}
-    return encode_arrays({'x': middle + x, 'y': middle + y, **grids})
+    grids = {'ground_z': z.astype(np.float32), 'ground_std': std.astype(np.float32)}
+    return encode_arrays({'x': middle, 'y': middle, **grids})

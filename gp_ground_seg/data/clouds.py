@@ -34,20 +34,11 @@ class Cloud:
         scan (N, 4), with the intensity.
     header : opaque
         Contents of the file beside the points, with which it is written again; None without.
-    origin : tuple of three floats
-        Place of the sensor in the coordinates of `fields` [m].
     """
 
     fields: Fields
     xyz: npt.NDArray[np.floating]
     header: Any = None
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def about(self, origin: tuple[float, float, float] | None) -> Cloud:
-        """Return the cloud with the sensor at another place, if one is given."""
-        if origin is None:
-            return self
-        return replace(self, xyz=self.xyz[:, :3] - np.array(origin), origin=origin)
 
     def take(self, mask: npt.NDArray[np.bool_]) -> Cloud:
         """Return the points where `mask` is true."""

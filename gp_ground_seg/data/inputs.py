@@ -14,18 +14,21 @@ from pathlib import Path
 from gp_ground_seg.core.errors import DataError, PointCloudError, shown
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
 from gp_ground_seg.data.bags import BagReader
-from gp_ground_seg.data.cloud_files import NUSCENES_SUFFIX, SUFFIXES, read_file
+from gp_ground_seg.data.cloud_files import (
+    FROM_TEXT,
+    NUSCENES_SUFFIX,
+    SUFFIXES,
+    TEXT_SUFFIXES,
+    read_file,
+)
 from gp_ground_seg.data.clouds import Cloud
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_fields, read_xyz
-from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
+from gp_ground_seg.data.scan_layout import KITTI_COLUMNS, check_scan
 
 # Where the scans of a data set are, in a folder of one of its drives, and these in its root.
 _SCAN_FOLDERS = ('.', 'velodyne', 'velodyne_points/data', 'samples/LIDAR_TOP')
 _DRIVES = ('sequences/*/velodyne', 'data_3d_raw/*/velodyne_points', '*/velodyne_points')
 
-# In a folder, a text may be of times or a calibration.
-_BY_NAME = ('.txt', '.csv')
-_IN_FOLDERS = tuple(suffix for suffix in SUFFIXES if suffix not in _BY_NAME)
 _OUTPUT = re.compile(r'_ground(_ground|_obstacles|_surface)?$')
 """What `segment` adds to the name of a scan whose output goes beside it."""
 _LOGGER = logging.getLogger('gp_ground_seg')
@@ -65,12 +68,10 @@ class Inputs:
         items: Sequence[Input],
         topic: str | None = None,
         n_messages: int = 0,
-        layout: ScanLayout = KITTI,
     ) -> None:
         self.path = path
         self.topic = topic  # of a bag, else None
         self._items = items
-        self._origin = layout.origin
         self._length = n_messages or len(items)
 
     def __len__(self) -> int:
@@ -85,7 +86,7 @@ class Inputs:
         with BagReader(self.path) as bag:
             for k, (_, time, raw) in enumerate(bag.messages([self.topic])):
                 place = f'message {k} of topic {self.topic}, recorded at {time} ns'
-                read = partial(_decode, raw, f'{self.path}: {place}', self._origin)
+                read = partial(_decode, raw, f'{self.path}: {place}')
                 title = shown(f'{self.path.name}[{k}]')
                 yield Input(f'{k:06d}', title, self.path, read)
 
@@ -97,7 +98,7 @@ class Inputs:
 
 
 def list_inputs(
-    source: str | Path, layout: ScanLayout = KITTI, topic: str | None = None
+    source: str | Path, columns: int = KITTI_COLUMNS, topic: str | None = None
 ) -> Inputs:
     """Return the clouds of `source`; DataError if there are none.
 
@@ -106,9 +107,9 @@ def list_inputs(
     source : str or Path
         A file of a known format; a folder of such files, of one or several formats; a sequence
         of SemanticKITTI, a raw drive of KITTI or KITTI-360; a bag.
-    layout : ScanLayout
-        Layout of ``.bin`` files, and whether to refuse clouds that do not look like a scan.
-        ``.pcd.bin`` of nuScenes has five columns, and is recognised by its name.
+    columns : int
+        Numbers of a point in ``.bin`` files. ``.pcd.bin`` of nuScenes has five, and is recognised
+        by its name.
     topic : str or None
         PointCloud2 topic of a bag, by default the only one.
     """
@@ -116,7 +117,7 @@ def list_inputs(
     if holds_bag(path):
         with BagReader(path) as bag:
             name = bag.pick_point_cloud_topic(topic)
-            return Inputs(path, (), name, bag.n_messages(name), layout)
+            return Inputs(path, (), name, bag.n_messages(name))
     if topic is not None:
         raise DataError(f'--topic: is for bags, which {source} is not')
     files = _find_files(path)
@@ -124,7 +125,7 @@ def list_inputs(
     clashing = {stem for stem, n in Counter(stems).items() if n > 1}
     names = [f.name if stem in clashing else stem for f, stem in zip(files, stems, strict=True)]
     pairs = zip(names, files, strict=True)
-    items = [Input(n, shown(f.name), f, partial(read_file, f, layout)) for n, f in pairs]
+    items = [Input(n, shown(f.name), f, partial(read_file, f, columns)) for n, f in pairs]
     return Inputs(path, items)
 
 
@@ -138,7 +139,7 @@ def holds_bag(path: Path) -> bool:
 
 def _is_scan(path: Path) -> bool:
     """Whether a file of a folder is taken for a scan."""
-    return path.suffix.lower() in _IN_FOLDERS
+    return path.suffix.lower() in SUFFIXES
 
 
 def _find_files(source: Path) -> Sequence[Path]:
@@ -146,6 +147,8 @@ def _find_files(source: Path) -> Sequence[Path]:
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
     if not source.is_dir():
+        if source.suffix.lower() in TEXT_SUFFIXES:
+            raise DataError(f'{source}: {FROM_TEXT}')
         if source.suffix.lower() not in SUFFIXES:
             raise DataError(
                 f'{source}: not a scan or bag; accepted are {accepted}, .bag, .mcap and .db3 '
@@ -161,8 +164,9 @@ def _find_files(source: Path) -> Sequence[Path]:
     if drives:
         names = ', '.join(Path(drive).name for drive in drives)
         hint = f'; give one of its sequences ({names}), as in {drives[0]}'
-    accepted = f'{", ".join(_IN_FOLDERS)} file in it ({" and ".join(_BY_NAME)} by name only)'
-    raise DataError(f'{source}: no {accepted}, and not a rosbag2 folder{hint}')
+    elif texts := [path for path in source.glob('*') if path.suffix.lower() in TEXT_SUFFIXES]:
+        hint = f'; {min(texts).name} may be {FROM_TEXT}'
+    raise DataError(f'{source}: no {accepted} file in it, and not a rosbag2 folder{hint}')
 
 
 def _without_output(files: Sequence[Path]) -> Sequence[Path]:
@@ -184,9 +188,11 @@ def _stem(path: Path) -> str:
     return name.removesuffix(NUSCENES_SUFFIX) if name.endswith(NUSCENES_SUFFIX) else path.stem
 
 
-def _decode(raw: bytes, place: str, origin: tuple[float, float, float] | None) -> Cloud:
+def _decode(raw: bytes, place: str) -> Cloud:
     try:
         message = decode_cloud(raw)
-        return Cloud(read_fields(message), read_xyz(message)).about(origin)
+        cloud = Cloud(read_fields(message), read_xyz(message))
     except PointCloudError as error:
         raise DataError(f'{place}: {error}') from error
+    check_scan(place, cloud.xyz)
+    return cloud

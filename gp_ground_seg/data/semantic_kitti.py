@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.files import read_bytes
-from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, check_scan, four_columns, read_scan
+from gp_ground_seg.data.scan_layout import KITTI_COLUMNS, four_columns, read_scan
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 FRAME_PERIOD = 0.1  # time between frames [s] where a sequence has no times.txt
@@ -29,7 +29,7 @@ class Frame:
     points_path: Path  # the ``.bin`` file
     labels_path: Path | None  # the ``.label`` file, if there is one
     time: float  # since the start of the sequence [s]
-    layout: ScanLayout = KITTI  # of the ``.bin`` file
+    columns: int = KITTI_COLUMNS  # of the ``.bin`` file
 
     def __str__(self) -> str:
         """Sequence and index."""
@@ -45,7 +45,7 @@ def list_sequences(root: str | Path) -> list[str]:
     return names
 
 
-def list_frames(root: str | Path, sequence: str, layout: ScanLayout = KITTI) -> list[Frame]:
+def list_frames(root: str | Path, sequence: str, columns: int = KITTI_COLUMNS) -> list[Frame]:
     """Frames of one sequence, in order; DataError if there are none, or times.txt does not fit."""
     folder = Path(root, 'sequences', sequence)
     if not (folder / 'velodyne').is_dir():
@@ -57,12 +57,12 @@ def list_frames(root: str | Path, sequence: str, layout: ScanLayout = KITTI) -> 
     labels = {path.stem: path for path in (folder / 'labels').glob('*.label')}
     frames = []
     for path, time in zip(paths, _read_times(folder / 'times.txt', paths), strict=True):
-        frames.append(Frame(sequence, path.stem, path, labels.get(path.stem), time, layout))
+        frames.append(Frame(sequence, path.stem, path, labels.get(path.stem), time, columns))
     return frames
 
 
 def labelled_frames(
-    root: str | Path, sequences: Sequence[str] | None = None, layout: ScanLayout = KITTI
+    root: str | Path, sequences: Sequence[str] | None = None, columns: int = KITTI_COLUMNS
 ) -> list[Frame]:
     """Frames of the named sequences, or of all that have labels, in order.
 
@@ -77,7 +77,7 @@ def labelled_frames(
         raise DataError(f'{root}: {problem}; sequences here: {", ".join(known)}')
     frames, left_out = [], []
     for name in chosen:
-        listed = list_frames(root, name, layout)
+        listed = list_frames(root, name, columns)
         bare = [frame.index for frame in listed if frame.labels_path is None]
         if sequences is None and len(bare) == len(listed):
             left_out.append(name)
@@ -113,15 +113,13 @@ def _read_times(path: Path, frames: Sequence[Path]) -> list[float]:
     return times
 
 
-def read_points(path: str | Path, layout: ScanLayout = KITTI) -> npt.NDArray[np.float32]:
+def read_points(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[np.float32]:
     """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4).
 
     Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
-    points, or, where the layout asks for that, can be no scan.
+    points, or can be no scan.
     """
-    table = read_scan(path, layout)
-    check_scan(path, table[:, :3], layout)
-    return four_columns(table)
+    return four_columns(read_scan(path, columns))
 
 
 def read_labels(path: str | Path, n_points: int) -> npt.NDArray[np.uint16]:

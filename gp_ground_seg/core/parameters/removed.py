@@ -42,6 +42,10 @@ REMOVED: dict[str, str] = {
     f'{PROGRAM} plot scan --surface': (
         f'use {PROGRAM} plot segment, or ~/ground_model of the node in RViz'
     ),
+    f'{PROGRAM} --dtype': 'save the numbers as float32, or as .npy, which knows its type',
+    f'{PROGRAM} --origin': (
+        "subtract it: xyz = points[:, :3] - (X, Y, Z); numpy.save('a.npy', xyz.astype('float32'))"
+    ),
     f'{PROGRAM} pose': f'use {PROGRAM} segment INPUT, which prints height and tilt',
     f'{PROGRAM} compare': f'use {PROGRAM} evaluate ROOT --against FILE_OR_PRESET',
     f'{PROGRAM} view': f'use {PROGRAM} tune INPUT, or Foxglove on what segment writes',
@@ -49,7 +53,7 @@ REMOVED: dict[str, str] = {
 }
 """What to use instead, by the ``NAME`` of a parameter, by ``NAME=VALUE`` where only a value is
 removed, or by the first words of a command line: those of a command, of one below it, or of either
-and an option."""
+and an option; of an option alone where every command had it."""
 
 
 def removal(name: str, value: object = None) -> str:
@@ -65,6 +69,6 @@ def removal_of_words(words: Sequence[str]) -> str:
     if url := next(filter(None, map(_URL.fullmatch, words)), None):
         return f'{url[1]}: no URLs; mount the folder (s3fs, rclone), or download the file'
     options = (word.partition('=')[0] for word in words if word.startswith('-'))
-    starts = [' '.join((PROGRAM, *words[:n])) for n in (1, 2)]
+    starts = [' '.join((PROGRAM, *words[:n])) for n in (0, 1, 2)]
     names = starts + [f'{start} {option}' for option in options for start in starts]
     return next((line for name in names if (line := removal(name))), '')

@@ -10,6 +10,11 @@ from gp_ground_seg.core.frame import BoolArray, FloatArray, PointArray
 
 COMPUTED = (np.dtype(np.float32), np.dtype(np.float64))
 """Types that are computed with."""
+FARTHEST = 1e4
+"""Range beyond which no sensor measures [m]."""
+_MAX_BEYOND = 0.1  # share of the points that may lie there, as wrong returns
+_N_JUDGED = 1000  # points looked at in a larger cloud
+_MOST_ROWS, _LEAST_COLUMNS = 8, 65  # of an array that is taken for a transposed one
 
 
 def take_points(points: npt.ArrayLike) -> PointArray:
@@ -17,7 +22,8 @@ def take_points(points: npt.ArrayLike) -> PointArray:
 
     Of `points` (N, >=3) columns after the third are ignored. The result (N, 3) shares memory with
     them, if it can; it is of single precision for types of up to four bytes. Raises a
-    PointCloudError if the shape or type is another, or the array is masked.
+    PointCloudError if the shape or type is another, the array is masked or transposed, or the
+    points are farther away than `FARTHEST`.
     """
     if isinstance(points, np.ma.MaskedArray):
         raise PointCloudError('points are a masked array: pass points.filled(numpy.nan)')
@@ -26,16 +32,37 @@ def take_points(points: npt.ArrayLike) -> PointArray:
         raise PointCloudError(
             f'points of shape {array.shape} and type {array.dtype}: must be (N, 3) or wider'
         )
-    if array.dtype in COMPUTED and array.flags.aligned:
-        return array[:, :3]
+    if array.shape[0] <= _MOST_ROWS and array.shape[1] >= _LEAST_COLUMNS:
+        raise PointCloudError(
+            f'points of shape {array.shape}: a point is a row; pass points.T, if they are columns'
+        )
     if not np.issubdtype(array.dtype, np.floating):
         raise PointCloudError(
             f'points of shape {array.shape} and type {array.dtype}: must be floating point'
         )
+    if problem := objection_to_ranges(array[:: 1 + len(array) // _N_JUDGED, :3]):
+        raise PointCloudError(problem)
+    if array.dtype in COMPUTED and array.flags.aligned:
+        return array[:, :3]
     dtype = np.dtype(np.float32 if array.dtype.itemsize <= 4 else np.float64)
     # Bytes from a sensor may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore'):
         return array[:, :3].astype(dtype, copy=not array.flags.aligned)
+
+
+def objection_to_ranges(xyz: PointArray) -> str:
+    """Return what is wrong where points (N, 3) are farther away than a sensor measures, or ''."""
+    with np.errstate(invalid='ignore'):
+        is_beyond = np.abs(xyz).max(axis=1, initial=0.0) > FARTHEST
+        is_beyond &= np.isfinite(xyz).all(axis=1)
+    if is_beyond.sum() <= _MAX_BEYOND * len(xyz):
+        return ''
+    middle = ', '.join(f'{value:.1f}' for value in np.median(xyz[is_beyond], axis=0))
+    return (
+        f'{is_beyond.mean():.0%} of the points are beyond 10 km, about {middle}; scans are in '
+        'metres about the sensor: of a map, subtract its place there in double precision, as in '
+        "xyz = points[:, :3] - (X, Y, Z); numpy.save('near.npy', xyz.astype('float32'))"
+    )
 
 
 def check_points(points: npt.ArrayLike) -> FloatArray:

@@ -278,7 +278,7 @@ def load_kitti(frame: Frame, cut: float = 0.0) -> KnownScan:
     """
     if frame.labels_path is None:
         raise DataError(f'{frame.points_path}: has no labels')
-    points = read_points(frame.points_path, frame.layout)
+    points = read_points(frame.points_path, frame.columns)
     entries = read_entries(frame.labels_path, len(points))
     semantic = (entries & 0xFFFF).astype(np.uint16)
     z = points[:, 2].astype(np.float64)
