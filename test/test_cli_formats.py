@@ -10,9 +10,8 @@ from bag_samples import scan, write_ros2_bag
 from cli_runner import error_line, run
 from conftest import REPOSITORY
 
-from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.data.cloud_files import WRITABLE, encode_file, read_file
 from gp_ground_seg.data.clouds import cloud_of, gather, name_columns
 from gp_ground_seg.data.inputs import list_inputs
@@ -65,25 +64,6 @@ def test_a_cloud_of_any_format_is_segmented_to_its_own(source, suffix, expected)
     np.testing.assert_allclose(found['gp_height'], expected.height, atol=2e-3)
 
 
-def test_ground_and_obstacles_apart(source, expected):
-    assert run('segment', source, '-o', source.with_name('out.ply'), '--split') == 0
-    for part, label in (('ground', Label.GROUND), ('obstacles', Label.OBSTACLE)):
-        found = read_file(source.with_name(f'out_{part}.ply')).fields
-        np.testing.assert_array_equal(found['x'], POINTS[expected.label == label, 0])
-        assert (found['label'] == label).all()
-
-
-def test_the_ground_as_a_grid(tmp_path, expected):
-    np.save(tmp_path / 'a.npy', POINTS)
-    assert run('segment', tmp_path / 'a.npy', '-o', tmp_path / 'out.pcd', '--surface') == 0
-    with np.load(tmp_path / 'out_surface.npz') as found:
-        x, y, z, std = (found[name] for name in ('x', 'y', 'ground_z', 'ground_std'))
-    expected_z, expected_std = GroundModel.of(expected).at(x, y[:, None])
-    assert np.isfinite(expected_z).sum() > 1000
-    np.testing.assert_allclose(z, expected_z, atol=1e-4)
-    np.testing.assert_allclose(std, expected_std, atol=1e-4)
-
-
 def test_a_folder_of_several_formats(tmp_path, expected, capsys):
     folder = tmp_path / 'in'
     folder.mkdir()
@@ -94,12 +74,11 @@ def test_a_folder_of_several_formats(tmp_path, expected, capsys):
     assert [one.name for one in list_inputs(folder)] == ['a.bin', 'a.npy', 'b']
     assert run('segment', folder, '-o', tmp_path / 'own', '--quiet') == 0
     own = sorted(path.name for path in (tmp_path / 'own').iterdir())
-    assert own == ['a.bin.label', 'a.npy.npy', 'b.label']
-    assert run('segment', folder, '-o', tmp_path / 'pcd', '--format', 'pcd', '--surface') == 0
+    assert own == ['a.bin.label', 'a.npy.npy', 'b.label', 'outputs.jsonl', 'parameters.yaml']
+    assert run('segment', folder, '-o', tmp_path / 'pcd', '--format', 'pcd') == 0
     for name in ('a.bin', 'a.npy', 'b'):
         found = read_file(tmp_path / 'pcd' / f'{name}.pcd').fields
         np.testing.assert_array_equal(found['label'], expected.label)
-        assert (tmp_path / 'pcd' / f'{name}_surface.npz').is_file()
     # nuScenes' fifth column, known by the name of the file.
     np.testing.assert_array_equal(found['column_5'], POINTS[:, 0])
 
@@ -187,10 +166,7 @@ def test_pictures_of_a_frame_of_a_bag_or_folder(tmp_path, capsys):
         (['folder', '-o', 'x.pcd'], 'x.pcd: must be a folder'),
         (['a.npy', '-o', 'x.pcd', '--format', 'ply'], 'x.pcd: ends in .pcd, which is not ply'),
         (['a.npy', '--topic', '/a'], '--topic: is for bags'),
-        (['a.npy', '--drop', '/a'], '--drop: is for bags'),
         (['a.npy', '--columns', '5'], '--columns: is for .bin scans, which a.npy is not'),
-        (['a.npy', '-o', 'x.label', '--split'], '--split: is for clouds'),
-        (['drive.mcap', '--split'], '--split: is for scans'),
         (['drive.mcap', '--format', 'pcd', '--columns', '5'], '--columns: is for .bin scans'),
         (['wide.npy', '-o', 'x.ply'], 'field t: PLY has no type uint64'),
         (['far.npy', '-o', 'x.pcd'], 'are beyond 10 km, about'),

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import shutil
 import signal
 import threading
@@ -18,6 +17,7 @@ from torture_resume import (
     delete_input,
     delete_output,
     link_output,
+    replace_input,
     resize_output,
 )
 
@@ -33,9 +33,9 @@ def root(tmp_path_factory):
 
 
 def finished(folder):
-    """Names in the manifest, in its order."""
-    lines = (folder / 'manifest.jsonl').read_text().splitlines()
-    return [name for line in lines for name in json.loads(line)['items']]
+    """Names in the record of what is written, in its order."""
+    lines = (folder / 'outputs.jsonl').read_text().splitlines()
+    return [name for line in lines for name in json.loads(line).get('written', {})]
 
 
 def test_several_bags_become_one_each(tmp_path, capsys):
@@ -44,44 +44,57 @@ def test_several_bags_become_one_each(tmp_path, capsys):
         write_ros2_bag(tmp_path / f'{name}.mcap', n_clouds=2 + k)
         assert run('segment', tmp_path / f'{name}.mcap', '--quiet') == 0
     bags = [tmp_path / f'{name}.mcap' for name in names]
-    assert run('segment', *bags, '-o', tmp_path / 'out') == 0
+    command = ['segment', *bags, '-o', tmp_path / 'out']
+    assert run(*command) == 0
     for name in names:
         file = f'{name}_ground.mcap'
         assert (tmp_path / 'out' / file).read_bytes() == (tmp_path / file).read_bytes()
     assert '5 frames' in capsys.readouterr().out
     # A block for each, which is kept if the next one is interrupted.
-    assert (tmp_path / 'out/manifest.jsonl').read_text().count('\n') == len(names)
-    assert run('segment', *bags, '-o', tmp_path / 'out', '--resume') == 0
+    assert (tmp_path / 'out/outputs.jsonl').read_text().count('written') == len(names)
+    assert run(*command) == 0
     assert capsys.readouterr().out == '2 of 2 were finished before\n'
     bags[1].unlink()
     write_ros2_bag(bags[1], n_clouds=4)
-    assert run('segment', *bags, '-o', tmp_path / 'out', '--resume') == 0
-    said = '1 of 2 were finished before; done again: 1 with a changed input (b_ground.mcap)'
-    assert capsys.readouterr().out.startswith(f'{said}\n4 frames, ')
+    assert run(*command) == 0
+    assert capsys.readouterr().out.startswith('1 of 2 were finished before\n4 frames, ')
     scan = write_streets(tmp_path, s00=1) / 'sequences/00/velodyne/000000.bin'
     assert run('segment', bags[0], scan, '-o', tmp_path / 'out2') == 2
     assert 'is no bag' in error_line(capsys)
 
 
 def test_what_is_there_is_kept_and_other_parameters_are_refused(root, tmp_path, capsys):
-    command = ['segment', root, '-o', tmp_path / 'out']
-    assert run(*command, '--resume') == 0  # nothing was begun yet
-    capsys.readouterr()
-    assert run(*command) == 2
-    assert 'exists already; --resume continues, --force starts anew' in error_line(capsys)
+    out = tmp_path / 'out'
+    command = ['segment', root, '-o', out]
+    assert run(*command) == 0
+    before, times = label_files(out), {path: path.stat().st_mtime_ns for path in out.rglob('*')}
+    assert run(*command) == 0
+    assert capsys.readouterr().out.endswith('12 of 12 were finished before\n')
+    assert {path: path.stat().st_mtime_ns for path in out.rglob('*')} == times
     other = ['--set', 'label.ground_tolerance=0.2']
-    before = label_files(tmp_path / 'out')
-    assert run(*command, '--resume', *other) == 2
-    first = json.loads((tmp_path / 'out/manifest.jsonl').read_text().splitlines()[0])
-    was, now = re.findall(r'\b[0-9a-f]{12}\b', error_line(capsys))
-    assert was == first['configuration'] != now
-    assert run(*command, '--resume', '--columns', '5', '--force') == 2
-    assert was in error_line(capsys)
-    assert run(*command, '--resume', '--force') == 0
-    assert label_files(tmp_path / 'out') == before
+    for words in (other, ['--columns', '4']):
+        assert run(*command, *words) == 2
+        assert f'{out}/parameters.yaml: says other parameters' in error_line(capsys)
+    assert label_files(out) == before
     assert run(*command, '--force', *other) == 0
-    assert label_files(tmp_path / 'out') != before
-    assert sorted(finished(tmp_path / 'out')) == sorted(before)
+    assert label_files(out) != before
+    assert sorted(finished(out)) == sorted(before)
+    assert run('config', 'check', out / 'parameters.yaml') == 0
+    assert '1 differs from the defaults' in capsys.readouterr().out
+
+
+def test_files_of_the_user_are_kept(root, tmp_path, capsys):
+    mine = tmp_path / 'out/sequences/00/predictions/000001.label'
+    mine.parent.mkdir(parents=True)
+    mine.write_text('by hand')
+    command = ['segment', root, '-o', tmp_path / 'out']
+    for _ in range(2):
+        assert run(*command) == 2
+        said = f'{mine}: exists already (1 of 12 files to write do); --force replaces them'
+        assert error_line(capsys) == said
+    assert mine.read_text() == 'by hand'
+    assert [path for path in (tmp_path / 'out').rglob('*') if path.is_file()] == [mine]
+    assert run(*command, '--force') == 0
 
 
 def other_folder(_rng, source, _out):
@@ -96,40 +109,39 @@ def other_folder(_rng, source, _out):
 @pytest.mark.parametrize(
     ('harm', 'said'),
     [
-        (other_folder, '0 of 12 were finished before; done again: 12 from another input'),
-        (change_input, '11 of 12 were finished before; done again: 1 with a changed'),
+        (other_folder, '12 frames'),
+        (change_input, '11 of 12 were finished before\n1 frame'),
+        (replace_input, '11 of 12 were finished before\n1 frame'),
         (delete_input, '11 of 11 were finished before'),
-        (delete_output, 'done again: 1 with output missing or of another size'),
-        (resize_output, 'done again: 1 with output missing or of another size'),
-        (link_output, 'done again: 1 with output missing or of another size'),
+        (delete_output, '11 of 12 were finished before\n1 frame'),
+        (resize_output, '11 of 12 were finished before\n1 frame'),
+        (link_output, '11 of 12 were finished before\n1 frame'),
     ],
 )
-def test_resume_does_again_what_does_not_fit(harm, said, root, tmp_path, capsys):
+def test_what_does_not_fit_is_done_again(harm, said, root, tmp_path, capsys):
     source, out, anew = tmp_path / 'root', tmp_path / 'out', tmp_path / 'anew'
     shutil.copytree(root, source)
     assert run('segment', source, '-o', out) == 0
     source = harm(np.random.default_rng(0), source, out) or source
     capsys.readouterr()
-    assert run('segment', source, '-o', out, '--resume') == 0
-    assert said in capsys.readouterr().out
+    assert run('segment', source, '-o', out) == 0
+    assert capsys.readouterr().out.startswith(said)
     assert run('segment', source, '-o', anew) == 0
     assert label_files(out) == label_files(anew)
     capsys.readouterr()
-    assert run('segment', source, '-o', out, '--resume') == 0
+    assert run('segment', source, '-o', out) == 0
     n = len(label_files(anew))
     assert capsys.readouterr().out == f'{n} of {n} were finished before\n'
 
 
-@pytest.mark.parametrize('line', [b'{', b'[' * 100_000, b'{"items": 3}', b'\xff', b'7', b'null'])
-def test_a_manifest_that_is_none(line, root, tmp_path, capsys):
-    (tmp_path / 'manifest.jsonl').write_bytes(line + b'\n')
-    assert run('segment', root, '-o', tmp_path, '--resume') == 2
-    assert error_line(capsys) == f'{tmp_path}/manifest.jsonl: line 1 is none of a manifest'
-    (tmp_path / 'manifest.jsonl').rename(tmp_path / 'of_the_user')
-    (tmp_path / 'manifest.jsonl').symlink_to('of_the_user')
-    assert run('segment', root, '-o', tmp_path, '--force') == 2
-    assert 'manifest.jsonl: ' in error_line(capsys)
-    assert (tmp_path / 'of_the_user').read_bytes() == line + b'\n'
+@pytest.mark.parametrize('line', [b'{', b'[' * 100_000, b'{"written": 3}', b'\xff', b'7', b'null'])
+def test_a_record_that_is_none(line, root, tmp_path, capsys):
+    (tmp_path / 'outputs.jsonl').write_bytes(line + b'\n')
+    assert run('segment', root, '-o', tmp_path) == 2
+    said = f'{tmp_path}/outputs.jsonl: line 1 is none of a record; --force starts anew'
+    assert error_line(capsys) == said
+    assert (tmp_path / 'outputs.jsonl').read_bytes() == line + b'\n'
+    assert run('segment', root, '-o', tmp_path, '--force') == 0
 
 
 @pytest.fixture(scope='module')
@@ -162,12 +174,13 @@ def test_killed_worker_and_client_lose_nothing_and_nothing_is_done_twice(
 ):
     out, command = tmp_path / 'out', ['segment', long_root, '-o', tmp_path / 'out']
     process = start(*command, '--workers', '2')
-    wait_for_lines(process, out / 'manifest.jsonl', 1)
+    # The first line is of what is to be written.
+    wait_for_lines(process, out / 'outputs.jsonl', 2)
     workers = children(process.pid)
     os.kill(workers[-1], signal.SIGKILL)
-    wait_for_lines(process, out / 'manifest.jsonl', 4)
+    wait_for_lines(process, out / 'outputs.jsonl', 5)
     workers += children(process.pid)
-    for more in ('--resume', '--force', '--quiet'):
+    for more in ('--force', '--quiet'):
         assert run(*command, more) == 2
         assert error_line(capsys) == f'{out}: another run writes to it'
     process.kill()
@@ -177,10 +190,10 @@ def test_killed_worker_and_client_lose_nothing_and_nothing_is_done_twice(
     before = finished(out)
     assert 0 < len(before) < N_FRAMES
     times = {name: (out / name).stat().st_mtime_ns for name in before}
-    with (out / 'manifest.jsonl').open('a') as file:
-        file.write('{"block": 7, "na')  # as a line that was being written
+    with (out / 'outputs.jsonl').open('a') as file:
+        file.write('{"written": {"na')  # as a line that was being written
     (out / 'sequences/00/predictions/.000999.label.partial-0').touch()
-    assert run(*command, '--resume') == 0
+    assert run(*command) == 0
     assert f'{len(before)} of {N_FRAMES} were finished before' in capsys.readouterr().out
     assert sorted(finished(out)) == [
         f'sequences/00/predictions/{k:06d}.label' for k in range(N_FRAMES)
@@ -196,7 +209,7 @@ def test_ctrl_c_ends_all_processes_with_one_line(long_root, tmp_path):
     process = start(
         'segment', long_root, '-o', tmp_path / 'out', '--workers', '2', start_new_session=True
     )
-    wait_for_lines(process, tmp_path / 'out/manifest.jsonl', 1)
+    wait_for_lines(process, tmp_path / 'out/outputs.jsonl', 2)
     workers = children(process.pid)
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=60)

@@ -1,7 +1,7 @@
-"""Data sets whose inputs, outputs or manifest change between two runs; two runs at once.
+"""Data sets whose inputs, outputs or record change between two runs; two runs at once.
 
-After `--resume` the labels are those of a new run, or it is refused with one line and nothing has
-changed: `python test/torture_resume.py FIRST STOP`.
+After a second run the labels are those of a new run, or it is refused with one line and nothing
+has changed: `python test/torture_resume.py FIRST STOP`.
 """
 
 import contextlib
@@ -79,21 +79,21 @@ def link_output(rng, _source, out):
     file.symlink_to('nowhere')
 
 
-def cut_manifest(rng, _source, out):
-    file = out / 'manifest.jsonl'
+def cut_record(rng, _source, out):
+    file = out / 'outputs.jsonl'
     os.truncate(file, rng.integers(file.stat().st_size + 1))
 
 
-def flip_manifest(rng, _source, out):
-    file = out / 'manifest.jsonl'
+def flip_record(rng, _source, out):
+    file = out / 'outputs.jsonl'
     data = bytearray(file.read_bytes())
     if data:
         data[rng.integers(len(data))] ^= 1 << rng.integers(8)
     file.write_bytes(data)
 
 
-def delete_manifest(_rng, _source, out):
-    (out / 'manifest.jsonl').unlink()
+def delete_record(_rng, _source, out):
+    (out / 'outputs.jsonl').unlink()
 
 
 def leave_partial(_rng, _source, out):
@@ -102,7 +102,7 @@ def leave_partial(_rng, _source, out):
 
 HARMS = [
     change_input, replace_input, add_input, delete_input, move_root, delete_output,
-    resize_output, link_output, cut_manifest, flip_manifest, delete_manifest, leave_partial,
+    resize_output, link_output, cut_record, flip_record, delete_record, leave_partial,
 ]  # fmt: skip
 
 
@@ -114,17 +114,17 @@ def said_by(*words):
 
 
 def harm(rng, command, source, out, anew):
-    """Return what is wrong after some harm and a `--resume`, or None."""
+    """Return what is wrong after some harm and a second run, or None."""
     code, said = said_by(*command, '-o', out)
     assert code == 0, said
     chosen = [HARMS[k] for k in rng.choice(len(HARMS), rng.integers(1, 4), replace=False)]
     for each in chosen:
-        with contextlib.suppress(FileNotFoundError):  # of a manifest that was deleted
+        with contextlib.suppress(FileNotFoundError):  # of a record that was deleted
             each(rng, source, out)
     what, before = ', '.join(each.__name__ for each in chosen), label_files(out)
-    code, said = said_by(*command, '-o', out, '--resume')
+    code, said = said_by(*command, '-o', out)
     if code == 2:
-        is_damaged = {flip_manifest, delete_manifest} & set(chosen)
+        is_damaged = {cut_record, flip_record, delete_record} & set(chosen)
         if not (is_damaged and said.count('\n') == 1 and label_files(out) == before):
             return f'{what}: {said[-300:]!r}'
         code, said = said_by(*command, '-o', out, '--force')
@@ -138,7 +138,7 @@ def harm(rng, command, source, out, anew):
 
 def compete(rng, command, _source, out, anew):
     """Return what is wrong after two runs at once, one of them killed in some cases, or None."""
-    words = rng.choice(['--resume', '--force'], 2)
+    words = rng.choice(['--quiet', '--force'], 2)
     two = [start(*command, '-o', out, each) for each in words]
     if is_killed := rng.random() < 0.5:
         with contextlib.suppress(Exception):
@@ -151,10 +151,12 @@ def compete(rng, command, _source, out, anew):
             return f'{words}: exit code {each.returncode}: {said[-300:]!r}'
     if not is_killed and not any(each.returncode == 0 for each in two):
         return f'{words}: both were refused'
-    code, said = said_by(*command, '-o', out, '--resume')
+    code, said = said_by(*command, '-o', out)
+    if code == 2 and is_killed and '--force replaces them' in said:  # killed before the record
+        code, said = said_by(*command, '-o', out, '--force')
     assert said_by(*command, '-o', anew)[0] == 0
     if code != 0 or label_files(out) != label_files(anew):
-        return f'{words}: not resumed: exit code {code}: {said[-300:]!r}'
+        return f'{words}: not continued: exit code {code}: {said[-300:]!r}'
     return None
 
 

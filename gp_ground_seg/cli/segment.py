@@ -3,23 +3,35 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+import statistics
+from contextlib import closing
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 
-from gp_ground_seg.cli import dataset, options
-from gp_ground_seg.core.errors import DataError
+from gp_ground_seg import __version__
+from gp_ground_seg.cli import options
+from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.core.parameters.export import to_yaml
 from gp_ground_seg.core.segmenter import GroundSegmenter
+from gp_ground_seg.data.atomic_output import check_writable
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
-from gp_ground_seg.data.bag_output import GROUND_TOPIC, OBSTACLES_TOPIC, BagOutput
-from gp_ground_seg.data.cloud_files import SUFFIXES, WRITABLE
-from gp_ground_seg.data.cloud_output import FORMATS, CloudOutput, encode_labels
-from gp_ground_seg.data.files import stamp, write_file
-from gp_ground_seg.data.inputs import holds_bag
-from gp_ground_seg.lab.scale.cluster import Progress
-from gp_ground_seg.lab.scale.dataset import Outcome, Scan, pool, segment_block
+from gp_ground_seg.data.bag_output import write_bag
+from gp_ground_seg.data.cloud_files import SUFFIXES, WRITABLE, read_file
+from gp_ground_seg.data.cloud_output import FORMATS, LABELS, format_for
+from gp_ground_seg.data.inputs import Input, Inputs, holds_bag, list_inputs
+from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences
+from gp_ground_seg.lab.scale.cluster import cut
+from gp_ground_seg.lab.scale.dataset import (
+    Item,
+    Outcome,
+    Record,
+    count_clouds,
+    segment_block,
+    sweep,
+    write_scans,
+)
 
 DESCRIPTION = """\
 Split scans into ground and obstacles.
@@ -28,30 +40,31 @@ INPUT is a scan (.bin .pcd .ply .npy .npz), a folder or sequence of scans, a bag
 (.bag .mcap .db3, or a rosbag2 folder), several bags, or a KITTI_ROOT. docs/datasets.md has more
 on formats, and on whole data sets.
 
-A .bin or text gives a .label file: 40 = ground, 99 = obstacle, 0 = not finite (SemanticKITTI).
+A .bin gives a .label file: 40 = ground, 99 = obstacle, 0 = not finite (SemanticKITTI).
 Other scans keep their format and get label (1 ground, 2 obstacle, 0 not finite), height,
-ground_z, ground_std and p_ground. A bag gives a rosbag2 with all its messages, and ground and
-obstacles after each cloud.
+ground_z, ground_std and p_ground. A bag gives a rosbag2 of the ground and the obstacles of each
+cloud.
+
+Begun again with the same words it goes on: what is written already, from inputs that have not
+changed since, is left out.
 
 At the end it prints height and tilt of the sensor, to check or to set (docs/pose.md).
 """
 EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label
   gp-ground-seg segment KITTI_ROOT/sequences/00 -o labels
-  gp-ground-seg segment scan.pcd -o scan.npz --surface
+  gp-ground-seg segment scan.pcd -o scan.npz
   gp-ground-seg segment drive.mcap                          writes drive_ground.mcap
-  gp-ground-seg segment KITTI_ROOT -o OUT --workers 8 --resume
+  gp-ground-seg segment KITTI_ROOT -o OUT --workers 8
   gp-ground-seg segment KITTI_ROOT -o OUT --scheduler tcp://host:8786
 """
-
-FOR_BAGS: tuple[str, ...] = ('ground_topic', 'obstacles_topic', 'drop')
-FOR_SCANS: tuple[str, ...] = ('split', 'surface')
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
     parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
     parser.usage = '%(prog)s INPUT [BAG ...] [-o OUT] [options]'
+    formats = (*FORMATS, *SUFFIX_OF_STORAGE)
     options.add(
         parser,
         ('input', 'scan, folder of scans, bag, or a root', {'metavar': 'INPUT'}),
@@ -59,96 +72,148 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('-o --output', 'for scans a folder, or a file for a single scan; for bags a folder, or '
          'a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
          {'metavar': 'OUT'}),
-        ('--resume', 'go on with OUT, whose finished blocks are in its manifest', options.FLAG),
+        ('--format', 'of the output (default: by the name of OUT, else labels of .bin scans, and '
+         f'as the input; mcap for ROS 1): {", ".join(formats)}',
+         {'choices': formats, 'metavar': 'FORMAT'}),
+        *options.CLOUDS,
         options.FORCE,
         options.QUIET,
     )  # fmt: skip
     options.add_cluster(parser)
     options.add_config(parser)
-    options.add(
-        parser.add_argument_group('for scans'),
-        ('--split', 'write ground and obstacles apart, as OUT_ground and OUT_obstacles',
-         options.FLAG),
-        ('--surface', 'write the ground as a grid as well, as OUT_surface.npz', options.FLAG),
-    )  # fmt: skip
-    topic, several = {'metavar': 'T'}, {'metavar': 'T', 'action': 'append', 'default': []}
-    formats = (*FORMATS, *SUFFIX_OF_STORAGE)
-    options.add(
-        parser,
-        ('--format', 'of the output (default: by the name of OUT, else labels of .bin scans, and '
-         f'as the input; mcap for ROS 1): {", ".join(formats)}',
-         {'choices': formats, 'metavar': 'FORMAT'}),
-        *options.CLOUDS,
-    )  # fmt: skip
-    options.add(
-        parser.add_argument_group('for bags'),
-        ('--ground-topic', f'topic of the ground (default: {GROUND_TOPIC})', topic),
-        ('--obstacles-topic', f'topic of the obstacles (default: {OBSTACLES_TOPIC})', topic),
-        ('--drop', 'leave this topic out of the output (may be repeated)', several),
-    )
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Segment the input, by its kind."""
+    """Write the files of each input that are not written yet, and print a summary."""
     config = options.read_config(arguments)
     source = Path(arguments.input)
-    is_bag = holds_bag(source)
-    gives_bag = is_bag and arguments.format not in FORMATS
-    kind, foreign = ('scans', FOR_SCANS) if gives_bag else ('bags', FOR_BAGS)
-    if not (is_bag or arguments.format in FORMATS):
-        foreign = (*foreign, 'topic', 'format')
-    for name in foreign:
-        if getattr(arguments, name):
-            option = name.replace('_', '-')
-            raise DataError(f'--{option}: is for {kind}, which {source} is not')
-    if is_bag:
-        options.refuse_columns(arguments, source)
-    if dataset.is_dataset(arguments):
-        _segment_dataset(arguments, config, is_bag)
-        return 0
     target = Path(arguments.output or _default_output(source, arguments.format))
-    segment = _segment_bag if gives_bag else _segment_scans
-    results = segment(target, arguments, GroundSegmenter(config))
-    dataset.print_summary(Outcome.of(results), target)
+    if holds_bag(source):
+        options.refuse_columns(arguments, source)
+    else:
+        for name in 'topic', 'format':
+            if vars(arguments)[name] not in (None, *FORMATS):
+                raise DataError(f'--{name}: is for bags, which {source} is not')
+    if arguments.more:
+        _segment_into(target, _list_bags(arguments), arguments, config)
+    elif holds_bag(source) and arguments.format not in FORMATS:
+        bag = _bag_item(source, target.name, arguments, force=arguments.force)
+        _segment_to(target, bag, arguments, config)
+    else:
+        _segment_scans(target, arguments, config)
     return 0
 
 
-def _segment_dataset(arguments: argparse.Namespace, config: Config, is_bag: bool) -> None:
-    """Segment a whole data set, or several bags, into a folder."""
-    target = Path(arguments.output or _default_output(Path(arguments.input)))
-    for name in ('format', 'split', 'surface'):
-        if getattr(arguments, name) not in (None, False, *SUFFIX_OF_STORAGE):
-            raise DataError(f'--{name}: whole data sets give .label files and bags')
-    if is_bag or arguments.more:
-        bags = dataset.list_bags(arguments, lambda path: _default_output(path).name)
-        write_bags = partial(_segment_bags, _bag_output(arguments), target)
-        dataset.run(arguments, config, target, bags, write_bags, 'bag')
-        return
-    scans = dataset.list_scans(arguments)
-    dataset.run(arguments, config, target, scans, partial(segment_block, _write_labels, target))
+def _segment_scans(target: Path, arguments: argparse.Namespace, config: Config) -> None:
+    """Segment scans, or the clouds of a bag, into files."""
+    source, form = Path(arguments.input), arguments.format
+    is_root = _is_root(source)
+    scans = Inputs(source, ()) if is_root else options.list_clouds(arguments)
+    is_file = target.suffix[1:] in FORMATS
+    is_single = not (source.is_dir() or holds_bag(source))
+    if is_file and not is_single:
+        raise DataError(f'{target}: must be a folder, {source} has several scans')
+    if target.suffix and is_single and not (is_file or target.is_dir()):
+        raise DataError(f'{target}: must be a folder, or end in .{", .".join(FORMATS)}')
+    if is_file and form not in (None, target.suffix[1:]):
+        raise DataError(f'{target}: ends in {target.suffix}, which is not {form}')
+    names = [f'{scan.name}.{format_for(scan.path, form)}' for scan in scans]
+    if is_root:
+        _segment_into(target, _list_root(arguments), arguments, config)
+    elif is_file:
+        scan = scans[0]
+        item = Item(scan.path, [target.name], partial(write_scans, [scan], [target.name]))
+        _segment_to(target, item, arguments, config)
+    elif holds_bag(source):
+        bag = Item(source, names, partial(write_scans, scans, names), len(scans))
+        _segment_into(target, [bag], arguments, config)
+    else:
+        pairs = zip(scans, names, strict=True)
+        items = [Item(s.path, [name], partial(write_scans, [s], [name])) for s, name in pairs]
+        _segment_into(target, items, arguments, config)
 
 
-def _segment_bags(
-    output: BagOutput,
-    target: Path,
-    config: Config,
-    bags: Sequence[Scan],
-    progress: Progress,
-) -> Outcome:
-    """Segment bags, each into one in the folder `target`."""
-    outcomes, segmenter = [], GroundSegmenter(config)
-    for bag in progress(bags):
-        path = target / bag.name
-        outcome = Outcome.of(output.write(bag.path, path, segmenter, force=True))
-        outcomes.append(outcome._replace(sizes=[stamp(path)[0]]))
-    return pool(outcomes)
+def _segment_to(target: Path, item: Item, arguments: argparse.Namespace, config: Config) -> None:
+    """Segment one input into one file or bag."""
+    if target.resolve() == item.path.resolve():
+        raise DataError(f'{target}: is the input; name another output')
+    if target.suffix[1:] in FORMATS:
+        check_writable(target, force=arguments.force)
+    options.note_leftovers(target, quiet=arguments.quiet)
+    bar = options.progress('segment', quiet=arguments.quiet)
+    results = item.write(GroundSegmenter(config), target.parent)
+    _print_summary(Outcome.of(bar(results, total=item.n_clouds)), target)
 
 
-def _write_labels(path: Path, result: Segmentation) -> int:
-    data = encode_labels(result)
-    write_file(path, data)
-    return len(data)
+def _segment_into(
+    folder: Path, items: list[Item], arguments: argparse.Namespace, config: Config
+) -> None:
+    """Segment what is left of several inputs into a folder."""
+    if not folder.resolve().parent.is_dir():
+        raise DataError(f'{folder}: the folder {folder.resolve().parent} does not exist')
+    title = f'written by gp-ground-seg segment {__version__}'
+    for name in 'topic', 'columns':
+        title += f', {name} {value}' if (value := vars(arguments)[name]) else ''
+    force = arguments.force
+    with closing(Record(folder, to_yaml(config, title))) as record:
+        left = record.find_left(items, force=force)
+        if len(left) < len(items):
+            print(f'{len(items) - len(left)} of {len(items)} were finished before')
+        if left:
+            with options.runner(arguments, 'segment') as runner:
+                record.begin(left, force=force)
+                # A bag takes long: each is a block by itself, and kept once it is finished.
+                group = attrgetter('path') if arguments.more else None
+                blocks, found = cut(left, group, runner.n_workers), Outcome.of([])
+                compute = partial(segment_block, folder, config)
+                outcomes = runner.map(compute, blocks, count_clouds)
+                for block, outcome in zip(blocks, outcomes, strict=True):
+                    record.add(block)
+                    found = found.joined(outcome)
+            _print_summary(found, folder, runner.n_workers)
+        sweep(folder, items)
+
+
+def _is_root(source: Path) -> bool:
+    return any(True for _ in source.glob('sequences/*/velodyne'))
+
+
+def _list_root(arguments: argparse.Namespace) -> list[Item]:
+    """List the scans of a SemanticKITTI root; labels go where its tools look for predictions."""
+    columns = options.columns_of(arguments)
+    if arguments.format not in (None, LABELS):
+        raise DataError(f'--format {arguments.format}: a KITTI_ROOT gives .label files')
+    items = []
+    for sequence in list_sequences(arguments.input):
+        for frame in list_frames(arguments.input, sequence, columns):
+            path = frame.points_path
+            scan = Input(str(frame), shown(path.name), path, partial(read_file, path, columns))
+            names = [f'sequences/{sequence}/predictions/{frame.index}.{LABELS}']
+            items.append(Item(path, names, partial(write_scans, [scan], names)))
+    return items
+
+
+def _list_bags(arguments: argparse.Namespace) -> list[Item]:
+    """List several bags, each of which becomes one in the output folder."""
+    paths = [Path(source) for source in (arguments.input, *arguments.more)]
+    for path in paths:
+        if not holds_bag(path):
+            raise DataError(f'{path}: is no bag, of several inputs each must be one')
+    names = [_default_output(path).name for path in paths]
+    for name in names:
+        if names.count(name) > 1:
+            raise DataError(f'two of the bags would become {name}')
+    # The record of the folder knows what may be replaced.
+    pairs = zip(paths, names, strict=True)
+    return [_bag_item(path, name, arguments, force=True) for path, name in pairs]
+
+
+def _bag_item(path: Path, name: str, arguments: argparse.Namespace, *, force: bool) -> Item:
+    """Item of a bag that becomes the bag `name`, which is replaced with `force`."""
+    n_clouds = len(list_inputs(path, topic=arguments.topic))
+    write = partial(write_bag, path, name, arguments.topic, arguments.format, force)
+    return Item(path, [name], write, n_clouds)
 
 
 def _default_output(source: Path, form: str | None = None) -> Path:
@@ -164,45 +229,37 @@ def _default_output(source: Path, form: str | None = None) -> Path:
     return named.with_name(f'{named.stem}_ground{suffix}')
 
 
-def _segment_scans(
-    target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter
-) -> Iterator[Segmentation]:
-    """Write the files of each scan; yield the results."""
-    scans = options.list_clouds(arguments)
-    is_file = target.suffix[1:] in FORMATS
-    has_several = scans.topic or Path(arguments.input).is_dir()
-    if is_file and has_several:
-        raise DataError(f'{target}: must be a folder, {arguments.input} has several scans')
-    if target.suffix and not (is_file or has_several or target.is_dir()):
-        raise DataError(f'{target}: must be a folder, or end in .{", .".join(FORMATS)}')
-    form = target.suffix[1:] if is_file else arguments.format
-    if arguments.format not in (None, form):
-        raise DataError(f'{target}: ends in {target.suffix}, which is not {arguments.format}')
-    output = CloudOutput(form, arguments.split, arguments.surface)
-    options.note_leftovers(target, quiet=arguments.quiet)
-    bar = options.progress('segment', quiet=arguments.quiet)
-    with output.staged(scans, target, is_file=is_file, force=arguments.force) as paths:
-        for scan in bar(scans, total=len(scans)):
-            yield output.write(scan, segmenter, paths(scan))
-
-
-def _segment_bag(
-    target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter
-) -> Iterator[Segmentation]:
-    """Write the bag of a bag; yield the results."""
-    clouds = options.list_clouds(arguments)
-    options.note_leftovers(target, quiet=arguments.quiet)
-    output = _bag_output(arguments)
-    results = output.write(Path(arguments.input), target, segmenter, force=arguments.force)
-    bar = options.progress('segment', quiet=arguments.quiet)
-    yield from bar(results, total=len(clouds))
-
-
-def _bag_output(arguments: argparse.Namespace) -> BagOutput:
-    return BagOutput(
-        arguments.topic,
-        arguments.ground_topic or GROUND_TOPIC,
-        arguments.obstacles_topic or OBSTACLES_TOPIC,
-        arguments.drop,
-        arguments.format,
+def _print_summary(found: Outcome, target: Path, n_workers: int = 0) -> None:
+    """Print points, ground, time, and height and tilt of the sensor."""
+    seconds = found.seconds
+    share = f'{found.n_ground / found.n_points:.1%} ground' if found.n_points else 'no ground'
+    pace = f'{1e3 * statistics.median(seconds[1:] or seconds):.1f} ms'
+    pace += ' per frame (median' if len(seconds) > 1 else ' for the first frame (with loading code'
+    beside = f' in each of {options.count(n_workers, "worker")}' if n_workers else ''
+    print(
+        f'{options.count(len(seconds), "frame")}, {options.count(found.n_points, "point")}, '
+        f'{share}, {pace}, segmentation only){beside}, written to {shown(target)}'
     )
+    if seconds:
+        print(_pose_summary(found))
+    if found.contradictions:
+        n_frames = options.count(len(found.contradictions), 'frame')
+        print(f'{shown(found.contradictions[0])} ({n_frames}: docs/pose.md)')
+
+
+def _pose_summary(found: Outcome) -> str:
+    """Median and standard deviation over the scans that show the pose, as parameters."""
+    if not found.heights:
+        return 'no frame shows enough ground to estimate the height of the sensor'
+    rolls, pitches = zip(*found.tilts, strict=True) if found.tilts else ((), ())
+    words = []
+    for name, values, digits, unit in (
+        ('height', found.heights, 2, 'm'),
+        ('roll', rolls, 3, 'rad'),
+        ('pitch', pitches, 3, 'rad'),
+    ):
+        if not values:
+            continue
+        spread = f' (std {statistics.stdev(values):.{digits}f})' if len(values) > 1 else ''
+        words.append(f'sensor.{name}={statistics.median(values):.{digits}f}{spread} {unit}')
+    return f'measured in {options.count(len(found.heights), "frame")}: {", ".join(words)}'

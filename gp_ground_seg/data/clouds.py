@@ -76,7 +76,8 @@ def name_columns(table: npt.NDArray[Any]) -> Fields:
     """Structured array (N,) of a table (N, columns); PointCloudError for too many columns."""
     check_numbers(table.shape[1])
     names = [*COLUMNS, *(f'column_{k}' for k in range(5, table.shape[1] + 1))]
-    return gather({name: table[:, k] for k, name in enumerate(names[: table.shape[1]])})
+    dtype = np.dtype([(name, table.dtype) for name in names[: table.shape[1]]])
+    return np.ascontiguousarray(table).view(dtype).reshape(len(table))
 
 
 def gather(columns: Mapping[str, npt.NDArray[Any]]) -> Fields:

@@ -48,7 +48,10 @@ def write_file(path: Path, data: bytes) -> None:
         partial = path.with_name(f'.{path.name}{PARTIAL_MARK}{uuid.uuid4().hex}')
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            partial.write_bytes(data)
+            with open(partial, 'wb') as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
             os.replace(partial, path)
         finally:
             partial.unlink(missing_ok=True)

@@ -42,6 +42,16 @@ REMOVED: dict[str, str] = {
     f'{PROGRAM} plot scan --surface': (
         f'use {PROGRAM} plot segment, or ~/ground_model of the node in RViz'
     ),
+    f'{PROGRAM} segment --resume': 'leave it out: what is written already is left out',
+    f'{PROGRAM} segment --split': 'select by label: points[label == 1] are ground',
+    f'{PROGRAM} segment --surface': (
+        'use ground_z and ground_std of each point, or GroundModel of the library (docs/api.md)'
+    ),
+    f'{PROGRAM} segment --ground-topic': 'use ros2 bag play --remap /ground:=NAME',
+    f'{PROGRAM} segment --obstacles-topic': 'use ros2 bag play --remap /obstacles:=NAME',
+    f'{PROGRAM} segment --drop': (
+        'leave it out: other topics are not copied; ros2 bag convert joins bags'
+    ),
     f'{PROGRAM} --dtype': 'save the numbers as float32, or as .npy, which knows its type',
     f'{PROGRAM} --origin': (
         "subtract it: xyz = points[:, :3] - (X, Y, Z); numpy.save('a.npy', xyz.astype('float32'))"

@@ -44,7 +44,7 @@ CONNECT_TIMEOUT = 10
 """Time in which a scheduler must answer [s]."""
 
 _NO_BAR = partial(tqdm, disable=True)
-Progress = Callable[[Sequence[Any]], Iterable[Any]]
+Progress = Callable[[Iterable[Any]], Iterable[Any]]
 """Wraps items to show how far the work is, as tqdm does."""
 Function = Callable[[Sequence[Any], Progress], Any]
 """Computes a block of items; a module's function or a `partial` of one, to be sent to workers."""
@@ -85,20 +85,25 @@ class Runner:
         is_here = self._open_executor is None
         return [*self.map(function, [items] if is_here else cut(items, group, self.n_workers))]
 
-    def map(self, function: Function, blocks: Sequence[Sequence[Any]]) -> Iterator[Any]:
-        """Yield what `function` makes of each block, in their order.
+    def map(
+        self,
+        function: Function,
+        blocks: Sequence[Sequence[Any]],
+        size_of: Callable[[Sequence[Any]], int] = len,
+    ) -> Iterator[Any]:
+        """Yield what `function` makes of each block, in their order; the bar is of their sizes.
 
         A block whose worker dies is computed again. Raises what `function` raises, and DataError
         if workers die again and again.
         """
-        with self._bar(total=sum(map(len, blocks))) as bar:
+        with self._bar(total=sum(map(size_of, blocks))) as bar:
             if self._open_executor is None:
                 for block in blocks:
                     yield function(block, partial(_count, bar))
                 return
             found, n_yielded = dict[int, Any](), 0
             for k, result in self._compute(function, dict(enumerate(blocks))):
-                bar.update(len(blocks[k]))
+                bar.update(size_of(blocks[k]))
                 found[k] = result
                 while n_yielded in found:
                     yield found.pop(n_yielded)

@@ -1,59 +1,58 @@
-"""Label files of whole data sets, block by block, and a record of the blocks that are finished."""
+"""Scans and bags that are segmented into files, and a record of the files that are written."""
 
 from __future__ import annotations
 
 import fcntl
-import hashlib
-import itertools
 import json
 import logging
 import os
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from functools import partial
-from pathlib import Path, PurePosixPath
-from typing import IO, Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import IO, NamedTuple
 
-import gp_ground_seg
 from gp_ground_seg.core.errors import DataError, PointCloudError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.atomic_output import PARTIAL_MARK
-from gp_ground_seg.data.files import read_bytes, stamp
-from gp_ground_seg.lab.scale.cluster import Progress, Runner, cut
+from gp_ground_seg.data.cloud_output import encode_output
+from gp_ground_seg.data.files import read_bytes, stamp, write_file
+from gp_ground_seg.data.inputs import Input
+from gp_ground_seg.lab.scale.cluster import Progress
 
 _LOGGER = logging.getLogger('gp_ground_seg')
-MANIFEST = 'manifest.jsonl'
-_MAX_MANIFEST_BYTES = 1 << 32
+RECORD, PARAMETERS = 'outputs.jsonl', 'parameters.yaml'
+_MAX_RECORD_BYTES = 1 << 32
 
 
-class Scan(NamedTuple):
-    """A scan to label."""
+class Item(NamedTuple):
+    """A scan or bag to segment."""
 
-    path: Path
-    name: str  # of the file to write, below the output folder
-    read: Callable[[], Any]  # returns the points
+    path: Path  # of the input
+    names: Sequence[str]  # of the files to write, below the output folder
+    # Writes them into a folder, and yields the result for each cloud.
+    write: Callable[[GroundSegmenter, Path], Iterator[Segmentation]]
+    n_clouds: int = 1
 
     def __str__(self) -> str:
         return str(self.path)
 
 
 class Outcome(NamedTuple):
-    """Numbers of the segmented scans: points, times, and what they show of the sensor's pose."""
+    """Numbers of the segmented clouds: points, times, and what they show of the sensor's pose."""
 
     n_points: int
     n_ground: int
-    seconds: list[float]  # of each scan, segmentation only
-    heights: list[float]  # of the sensor, by the scans that show it [m]
-    tilts: list[tuple[float, float]]  # roll and pitch, by the scans that show them [rad]
-    contradictions: list[str]  # of the scans that contradict a parameter
-    sizes: list[int]  # of the files that were written block by block [bytes]
+    seconds: list[float]  # of each cloud, segmentation only
+    heights: list[float]  # of the sensor, by the clouds that show it [m]
+    tilts: list[tuple[float, float]]  # roll and pitch, by the clouds that show them [rad]
+    contradictions: list[str]  # of the clouds that contradict a parameter
 
     @classmethod
     def of(cls, results: Iterable[Segmentation]) -> Outcome:
-        """Sum up scans, one by one."""
-        found = cls(0, 0, [], [], [], [], [])
+        """Sum up clouds, one by one."""
+        found = cls(0, 0, [], [], [], [])
         for result in results:
             n_ground = int((result.label == Label.GROUND).sum())
             found = found._replace(
@@ -68,160 +67,161 @@ class Outcome(NamedTuple):
                 found.tilts.append((measured.roll, measured.pitch))
         return found
 
+    def joined(self, other: Outcome) -> Outcome:
+        """Put further clouds behind these."""
+        return Outcome(
+            self.n_points + other.n_points,
+            self.n_ground + other.n_ground,
+            self.seconds + other.seconds,
+            self.heights + other.heights,
+            self.tilts + other.tilts,
+            self.contradictions + other.contradictions,
+        )
 
-def pool(outcomes: Iterable[Outcome]) -> Outcome:
-    """Put the scans of several outcomes together."""
-    n_points, n_ground, *lists = zip(*outcomes, strict=True)
-    return Outcome(sum(n_points), sum(n_ground), *([*itertools.chain(*parts)] for parts in lists))
+
+def write_scans(
+    scans: Iterable[Input], names: Sequence[str], segmenter: GroundSegmenter, folder: Path
+) -> Iterator[Segmentation]:
+    """Write a file for each scan, and yield the results: the `write` of an `Item`."""
+    for scan, name in zip(scans, names, strict=True):
+        cloud, path = scan.read(), folder / name
+        try:
+            result = segmenter.segment(cloud.xyz)
+        except PointCloudError as error:
+            raise PointCloudError(f'{scan.path}: {error}') from error
+        write_file(path, encode_output(path, cloud, result))
+        yield result
 
 
 def segment_block(
-    write: Callable[[Path, Segmentation], int],
-    target: Path,
-    config: Config,
-    scans: Sequence[Scan],
-    progress: Progress,
+    folder: Path, config: Config, items: Sequence[Item], progress: Progress
 ) -> Outcome:
-    """Label scans and write their files.
-
-    `write` takes the path of a file and the `Segmentation`, and returns its size [bytes].
-    """
-    sizes = []
-
-    def results(segmenter: GroundSegmenter) -> Iterator[Segmentation]:
-        for scan in progress(scans):
-            try:
-                result = segmenter.segment(scan.read())
-            except PointCloudError as error:
-                raise PointCloudError(f'{scan.path}: {error}') from error
-            sizes.append(write(target / scan.name, result))
-            yield result
-
-    return Outcome.of(results(GroundSegmenter(config)))._replace(sizes=sizes)
+    """Segment items into the files of a folder."""
+    segmenter = GroundSegmenter(config)
+    results = (result for item in items for result in item.write(segmenter, folder))
+    return Outcome.of(progress(results))
 
 
-class Manifest:
-    """What is finished: a line for each block, in a file in the output folder.
+def count_clouds(items: Iterable[Item]) -> int:
+    """Count the clouds of items."""
+    return sum(item.n_clouds for item in items)
 
-    It has for each scan the path, size and time of the input, and the size of the output. While it
-    is in use it is locked, and nothing is written to it before `begin`.
+
+class Record:
+    """What a folder has of earlier runs: their parameters, and a line for each step of a run.
+
+    The first line of a run has the names of the files that it is to write; they were not there, or
+    were to be replaced. Further lines have, by name, size and time of the input and size of the
+    output of the files that are written. While it is in use the record is locked, and nothing is
+    written before `begin`.
 
     Parameters
     ----------
     folder : Path
         Output folder.
-    configuration : str
-        Digest of all that the output depends on, beside the inputs; see `digest`.
-    scans : sequence of Scan
-        All that are to be labelled.
+    parameters : str
+        All that the output depends on, beside the inputs.
     """
 
-    def __init__(self, folder: Path, configuration: str, scans: Sequence[Scan]) -> None:
-        self._path = folder / MANIFEST
-        self._run = {'configuration': configuration, 'version': gp_ground_seg.__version__}
-        self._inputs = {
-            scan.name: [os.path.realpath(scan.path), *stamp(scan.path)] for scan in scans
-        }
-        self._text = b''
+    def __init__(self, folder: Path, parameters: str) -> None:
+        self._folder, self._parameters = folder, parameters
         self._file: IO[bytes] | None = None
+        self._inputs: dict[Path, tuple[int, str]] = {}
 
-    def open(self, *, resume: bool, force: bool) -> tuple[set[str], str]:
-        """Lock the folder; return names of what is finished, and what is done again and why.
+    def find_left(self, items: Sequence[Item], *, force: bool) -> list[Item]:
+        """Lock the folder, and return the items that are not finished; all with `force`.
 
-        Raises DataError if another run writes to the folder, with `resume` if it was begun with
-        other parameters, and if it has output but neither `resume` nor `force` is given.
+        Raises DataError if another run writes to the folder, and without `force` if it has files
+        of other parameters, or files to write that no run has written.
         """
-        is_begun = self._path.exists()
-        if is_begun:
-            self._lock(0)
-        sizes = self._output_sizes()
-        if resume and is_begun:
-            return self._compare(self._read(), sizes)
-        if (sizes or is_begun) and not force:
-            name = next(iter(sizes), MANIFEST)
-            place = self._path.parent / name
-            raise DataError(f'{place}: exists already; --resume continues, --force starts anew')
-        return set(), ''
+        if self._folder.exists() and not self._folder.is_dir():
+            raise DataError(f'{self._folder}: is a file, must be a folder')
+        self._inputs = {item.path: stamp(item.path) for item in items}
+        inputs = {path.resolve() for path in self._inputs}
+        for name in (name for item in items for name in item.names):
+            if (self._folder / name).resolve() in inputs:
+                raise DataError(f'{self._folder / name}: is the input; name another output')
+        if (self._folder / RECORD).exists():
+            self._lock()
+        if force:
+            return [*items]
+        self._check_parameters()
+        planned, written = self._read()
+        left = [item for item in items if not self._is_finished(item, written)]
+        wanted = [name for item in left for name in item.names]
+        foreign = [n for n in wanted if n not in planned and os.path.lexists(self._folder / n)]
+        if foreign:
+            raise DataError(
+                f'{self._folder / foreign[0]}: exists already ({len(foreign)} of {len(wanted)} '
+                'files to write do); --force replaces them'
+            )
+        return left
 
-    def _lock(self, flags: int) -> None:
+    def _is_finished(self, item: Item, written: dict[str, list[object]]) -> bool:
+        given = self._inputs[item.path]
+        outputs = ((name, stamp(self._folder / name)[0]) for name in item.names)
+        return all(written.get(name) == [*given, size] for name, size in outputs)
+
+    def _lock(self) -> None:
         """Open the file; the kernel frees its lock with the process, however that ends."""
-        try:
-            # Not by a link that someone else has planted.
-            number = os.open(self._path, os.O_RDWR | os.O_NOFOLLOW | flags, 0o666)
-            self._file = os.fdopen(number, 'rb+', buffering=0)
-        except FileExistsError as error:
-            raise DataError(f'{self._path.parent}: another run writes to it') from error
+        number = os.open(self._folder / RECORD, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
+        self._file = os.fdopen(number, 'rb+', buffering=0)
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise DataError(f'{self._path.parent}: another run writes to it') from error
+            raise DataError(f'{self._folder}: another run writes to it') from error
         except OSError:
-            _LOGGER.warning('%s: has no locks, start no other run', self._path.parent)
+            _LOGGER.warning('%s: has no locks, start no other run', self._folder)
 
-    def _read(self) -> dict[str, list[Any]]:
-        """Return path, size and time of the input, and size of the output, by name."""
-        text = read_bytes(self._path, _MAX_MANIFEST_BYTES)
-        # The last line of a run that was killed may be cut off.
-        self._text = text[: text.rfind(b'\n') + 1]
-        found: dict[str, list[Any]] = {}
-        for number, line in enumerate(self._text.splitlines(), 1):
+    def _check_parameters(self) -> None:
+        path = self._folder / PARAMETERS
+        if path.exists() and read_bytes(path, 1 << 20) != self._parameters.encode():
+            raise DataError(
+                f'{path}: says other parameters, or another version; give another output folder, '
+                'or --force to start anew'
+            )
+
+    def _read(self) -> tuple[set[str], dict[str, list[object]]]:
+        """Return the names of files to write, and of those that are written what is known."""
+        planned, written = set[str](), dict[str, list[object]]()
+        if self._file is None:
+            return planned, written
+        lines = read_bytes(self._folder / RECORD, _MAX_RECORD_BYTES).split(b'\n')
+        for number, line in enumerate(lines[:-1], 1):
             try:
                 entry = json.loads(line)
-                known = {key: entry[key] for key in self._run}
-                found.update({name: list(about) for name, about in entry['items'].items()})
-            except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-                raise DataError(f'{self._path}: line {number} is none of a manifest') from error
-            if known != self._run:
-                was, now = (f'{d["configuration"]} of {d["version"]}' for d in (known, self._run))
-                raise DataError(
-                    f'{self._path}: was begun with the configuration {was}, this is {now}; give '
-                    'the parameters of then, or another output folder'
+                planned.update(map(str, entry.get('to_write', [])))
+                written.update(
+                    {name: [*about] for name, about in entry.get('written', {}).items()}
                 )
-        return found
+            except (ValueError, TypeError, AttributeError, RecursionError) as error:
+                place = f'{self._folder / RECORD}: line {number}'
+                raise DataError(f'{place} is none of a record; --force starts anew') from error
+        return planned, written
 
-    def _compare(self, known: dict[str, list[Any]], sizes: dict[str, int]) -> tuple[set[str], str]:
-        """Return the names of what is as it was, and how many are not, for each reason."""
-        done, again = set[str](), dict[str, list[str]]()
-        for name, given in self._inputs.items():
-            if name not in known:
-                continue
-            *was, size = known[name] or [None]
-            if was[:1] != given[:1]:
-                again.setdefault('from another input', []).append(name)
-            elif was != given:
-                again.setdefault('with a changed input', []).append(name)
-            elif sizes.get(name) != size:
-                again.setdefault('with output missing or of another size', []).append(name)
-            else:
-                done.add(name)
-        said = (f'{len(names)} {reason} ({names[0]})' for reason, names in again.items())
-        return done, ', '.join(said)
-
-    def _output_sizes(self) -> dict[str, int]:
-        """Return the size of each file to write that is there [bytes]."""
-        folders = {PurePosixPath(name).parent for name in self._inputs}
-        there = {
-            str(f / o.name): o for f in folders for o in (self._path.parent / str(f)).glob('*')
-        }
-        return {name: stamp(there[name])[0] for name in self._inputs if name in there}
-
-    def begin(self) -> None:
-        """Keep the whole lines that were read, none by default; what follows may write output."""
-        self._path.parent.mkdir(parents=True, exist_ok=True)
+    def begin(self, items: Sequence[Item], *, force: bool) -> None:
+        """Note the files of the items: what follows may write them. With `force` begin anew."""
+        self._folder.mkdir(parents=True, exist_ok=True)
         if self._file is None:
-            self._lock(os.O_CREAT | os.O_EXCL)
+            self._lock()
         assert self._file is not None
-        self._file.truncate(len(self._text))
-        self._file.seek(len(self._text))
+        # The last line of a run that was killed may be cut off.
+        known = b'' if force else read_bytes(self._folder / RECORD, _MAX_RECORD_BYTES)
+        self._file.truncate(known.rfind(b'\n') + 1)
+        write_file(self._folder / PARAMETERS, self._parameters.encode())
+        self._append({'to_write': [name for item in items for name in item.names]})
 
-    def add(self, names: Sequence[str], sizes: Sequence[int]) -> None:
-        """Note that a block is finished, with the sizes of its outputs [bytes]."""
-        items = {n: [*self._inputs[n], size] for n, size in zip(names, sizes, strict=True)}
-        entry = {'block': self._text.count(b'\n'), 'items': items, **self._run}
-        line = json.dumps(entry).encode() + b'\n'
+    def add(self, items: Iterable[Item]) -> None:
+        """Note that the files of the items are written."""
+        written = {}
+        for item in items:
+            given = self._inputs[item.path]
+            written.update({n: [*given, stamp(self._folder / n)[0]] for n in item.names})
+        self._append({'written': written})
+
+    def _append(self, entry: dict[str, object]) -> None:
         assert self._file is not None
-        self._file.write(line)
-        self._text += line
+        self._file.write(json.dumps(entry).encode() + b'\n')
 
     def close(self) -> None:
         """Free the lock."""
@@ -229,37 +229,9 @@ class Manifest:
             self._file.close()
 
 
-def run_blocks(
-    runner: Runner,
-    function: Callable[[Config, Sequence[Scan], Progress], Outcome],
-    config: Config,
-    items: Sequence[Scan],
-    manifest: Manifest,
-    done: set[str],
-    group: Callable[[Any], Hashable] | None,
-) -> Outcome:
-    """Compute the items whose names are not `done`, and add each block to the manifest.
-
-    Blocks are cut by `group`, see `cut`.
-    """
-    left = [item for item in items if item.name not in done]
-    blocks = cut(left, group, runner.n_workers)
-    found = []
-    for block, outcome in zip(blocks, runner.map(partial(function, config), blocks), strict=True):
-        manifest.add([item.name for item in block], outcome.sizes)
-        found.append(outcome)
-    return pool(found)
-
-
-def digest(config: Config, *more: object) -> str:
-    """Digest of what labels depend on: the parameters, and `more`."""
-    text = json.dumps([config.nested(), *map(repr, more)], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
-
-
-def sweep(folder: Path, names: Iterable[str]) -> None:
-    """Delete what killed workers left of the files `names`, all of which are finished."""
-    for parent in {folder / Path(name).parent for name in names}:
+def sweep(folder: Path, items: Iterable[Item]) -> None:
+    """Delete what killed workers left of the files of the items, all of which are finished."""
+    for parent in {(folder / name).parent for item in items for name in item.names}:
         for left in parent.glob(f'.*{PARTIAL_MARK}*'):
             if left.is_file():
                 left.unlink(missing_ok=True)
