@@ -121,6 +121,7 @@ def test_empty_and_all_nan_clouds_give_empty_clouds(tmp_path):
         bag.add_topic(cloud_topic('/points'))
         for k, cloud in enumerate((nothing, nan)):
             bag.write('/points', k, encode_cloud(cloud))
+    assert segment(tmp_path / 'in.mcap', '--format', 'npz', '-o', tmp_path / 'arrays') == 0
     assert segment(tmp_path / 'in.mcap') == 0
     messages = read_messages(tmp_path / 'in_ground.mcap')
     widths = [(topic, decode_cloud(raw).width) for topic, _, raw in messages]

@@ -112,6 +112,27 @@ def test_another_number_of_columns_is_seen_by_the_distances(scans, tmp_path, col
     assert n_named >= 0.9 * n_wrong
 
 
+def in_turns(points):
+    """In the order of a sensor whose lower and upper beams fire in turns."""
+    x, y, z, _ = points.T
+    degrees = np.round(np.degrees(np.arctan2(z, np.hypot(x, y))))
+    beam = np.unique(degrees, return_inverse=True)[1]
+    half = (beam.max() + 2) // 2
+    turn = np.where(beam < half, 2 * beam, 2 * (beam - half) + 1)
+    return points[np.lexsort((turn, np.floor(np.arctan2(y, x) * 300.0)))]
+
+
+@pytest.mark.parametrize('sensor', ['vlp-16', 'hdl-32e'])
+def test_beams_in_turns_and_lost_returns_are_no_other_columns(tmp_path, sensor):
+    path, rng = tmp_path / 'a.bin', np.random.default_rng(2)
+    points = in_turns(simulated('urban', sensor, 1).points)
+    for share in (0.0, 0.4, 0.9):
+        lost = (rng.random(len(points)) < share)[:, None] & (np.arange(4) < 3)
+        table = np.where(lost, np.float32(0.0), points)[: len(points) // 840 * 840]
+        table.tofile(path)
+        np.testing.assert_array_equal(read_points(path), table)
+
+
 def test_columns_that_are_asked_for_are_read(tmp_path):
     points, path = simulated('urban', seed=1).points, tmp_path / 'a.bin'
     for n_columns in (3, 4, 5, 7):

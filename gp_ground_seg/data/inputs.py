@@ -12,6 +12,7 @@ from itertools import islice
 from pathlib import Path
 
 from gp_ground_seg.core.errors import DataError, PointCloudError, shown
+from gp_ground_seg.core.pipeline.points import take_points
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.cloud_files import (
@@ -23,7 +24,7 @@ from gp_ground_seg.data.cloud_files import (
 )
 from gp_ground_seg.data.clouds import Cloud
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_fields, read_xyz
-from gp_ground_seg.data.scan_layout import KITTI_COLUMNS, check_scan
+from gp_ground_seg.data.scan_layout import KITTI_COLUMNS
 
 # Where the scans of a data set are, in a folder of one of its drives, and these in its root.
 _SCAN_FOLDERS = ('.', 'velodyne', 'velodyne_points/data', 'samples/LIDAR_TOP')
@@ -191,8 +192,7 @@ def _stem(path: Path) -> str:
 def _decode(raw: bytes, place: str) -> Cloud:
     try:
         message = decode_cloud(raw)
-        cloud = Cloud(read_fields(message), read_xyz(message))
+        # A cloud without points is one of a drive, and no error as a file of its own is.
+        return Cloud(read_fields(message), take_points(read_xyz(message)))
     except PointCloudError as error:
         raise DataError(f'{place}: {error}') from error
-    check_scan(place, cloud.xyz)
-    return cloud
