@@ -103,7 +103,7 @@ def test_another_number_of_columns_is_seen_by_the_distances(scans, tmp_path, col
         for extra in more:
             np.hstack([points[:, :3], extra])[:, :columns].astype('<f4').tofile(path)
             assert len(read_points(path, columns)) == len(points)
-            for wrong in {3, 4, 5, 6} - {columns, 2 * columns}:
+            for wrong in {3, 4, 5, 6} - {columns, 2 * columns, columns // 2}:
                 n_wrong += 1
                 try:
                     read_points(path, wrong)
