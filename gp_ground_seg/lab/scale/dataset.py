@@ -145,8 +145,8 @@ class Record:
             self._lock()
         if force:
             return [*items]
-        self._check_parameters()
         planned, written = self._read()
+        self._check_parameters(planned)
         left = [item for item in items if not self._is_finished(item, written)]
         wanted = [name for item in left for name in item.names]
         foreign = [n for n in wanted if n not in planned and os.path.lexists(self._folder / n)]
@@ -173,9 +173,11 @@ class Record:
         except OSError:
             _LOGGER.warning('%s: has no locks, start no other run', self._folder)
 
-    def _check_parameters(self) -> None:
+    def _check_parameters(self, planned: set[str]) -> None:
+        """Raise DataError if others are there, of the user or of files that have been written."""
         path = self._folder / PARAMETERS
-        if path.exists() and read_bytes(path, 1 << 20) != self._parameters.encode():
+        is_in_use = self._file is None or any((self._folder / name).exists() for name in planned)
+        if is_in_use and path.exists() and read_bytes(path, 1 << 20) != self._parameters.encode():
             raise DataError(
                 f'{path}: says other parameters, or another version; give another output folder, '
                 'or --force to start anew'
