@@ -10,7 +10,11 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
+from bag_samples import scan
+from cli_runner import start
 
+from gp_ground_seg import Config
+from gp_ground_seg.cli import options
 from gp_ground_seg.core import jit as jit_module
 
 MODULE = """
@@ -21,6 +25,10 @@ from gp_ground_seg.core.jit import (
 @jit(entry=True)
 def double(x):
     return 2.0 * x
+
+@jit(entry=True)
+def half(x):
+    return 0.5 * x
 """
 RUN = """
 import json, logging, os, sys
@@ -31,7 +39,9 @@ if 'IDLE' not in os.environ:
 result = None if 'IDLE' in os.environ else small.double(21.0)
 hits, misses = (sum(c.values()) for c in small.double.stats[1:]) if small.JIT_ENABLED else (0, 0)
 was_kept = small.is_code_kept()
-small.keep_code(warm='COLD' not in os.environ)
+if 'COLD' not in os.environ:
+    small.half(1.0)
+small.keep_code()
 folder = small.code_folder()
 print(json.dumps([result, hits, misses, was_kept, str(folder) if folder else None]))
 """
@@ -90,7 +100,7 @@ def test_nothing_is_announced_before_it_compiles(program):
 
 
 def test_what_a_command_has_compiled_is_not_announced_again(program):
-    """Only `warm_up` knows that all is there, but nothing is missing after a command."""
+    """A command may need a part of the code: that is not all, but nothing of it is missing."""
     assert program.run(COLD='1')[:4] == COMPILED
     assert program.run(COLD='1')[:4] == [42.0, 1, 0, False]
     assert program.stderr == ''
@@ -215,3 +225,33 @@ def test_the_digest_covers_every_file_that_compiled_code_is_made_from():
 
         with patch.object(Path, 'read_bytes', read):
             assert jit_module._digest() != before
+
+
+@pytest.mark.skipif(not jit_module.JIT_ENABLED, reason='nothing is compiled')
+def test_few_scans_do_not_wait_for_the_compiler(tmp_path):
+    """And have the labels of numpy."""
+    scan(1).tofile(tmp_path / 'a.bin')
+    labels = []
+    for more, n_notes in ([], 1), (['--quiet'], 0), (['--set', 'runtime.backend=numpy'], 0):
+        process = start(
+            'segment', 'a.bin', '-o', 'a.label', '--force', *more, cwd=tmp_path,
+            env={**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path / 'none'), 'NUMBA_DISABLE_JIT': '0'},
+        )  # fmt: skip
+        said = process.communicate(timeout=60)[1]
+        assert process.returncode == 0
+        assert said.count('segmenting with numpy; to have compiled code, run') == n_notes
+        assert 'compiling' not in said
+        labels.append((tmp_path / 'a.label').read_bytes())
+    assert len(set(labels)) == 1
+
+
+def test_many_scans_or_a_backend_asked_for_are_compiled(monkeypatch):
+    for is_missing in (True, False):
+        monkeypatch.setattr(options, 'has_to_compile', lambda found=is_missing: found)
+        for backend in ('auto', 'numba', 'numpy'):
+            config = Config().replace(**{'runtime.backend': backend})
+            for n_scans in (1, options.COMPILING_PAYS - 1, options.COMPILING_PAYS):
+                found = options.spare_compiling(config, n_scans)
+                is_few = n_scans < options.COMPILING_PAYS
+                expected = 'numpy' if is_missing and is_few and backend == 'auto' else backend
+                assert found == config.replace(**{'runtime.backend': expected})

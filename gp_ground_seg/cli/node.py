@@ -17,7 +17,7 @@ NODE_EXAMPLES = """\
 """
 WARM_UP_DESCRIPTION = """\
 Compile what the node would compile at its first start, for a robot or an image of one. The
-node then has its compiled code after a second, not after 10 to 40. The code is kept on disk,
+node then has its compiled code after a second, not after 20 to 60. The code is kept on disk,
 for this version, this processor and this user.
 """
 WARM_UP_EXAMPLES = """\

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from gp_ground_seg.core import log
 from gp_ground_seg.core.errors import ConfigError, DataError, shown
+from gp_ground_seg.core.jit import has_to_compile
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.export import differences, yaml_scalar
 from gp_ground_seg.core.parameters.presets import PRESETS, find_preset
@@ -26,6 +27,7 @@ from gp_ground_seg.data.scan_layout import KITTI_COLUMNS, MIN_COLUMNS
 from gp_ground_seg.lab.scale.cluster import Runner, open_runner
 
 DEFAULT_PRESET = 'default'
+COMPILING_PAYS = 300  # scans
 FLAG = {'action': 'store_true'}
 FORCE = ('--force', 'replace existing output', FLAG)
 MARKDOWN = ('--markdown', 'print the tables as Markdown', FLAG)
@@ -169,6 +171,19 @@ def read_config(arguments: argparse.Namespace) -> Config:
     if arguments.config:
         config = Config.from_yaml(arguments.config, config)
     return config.replace(**dict(parse_setting(setting) for setting in arguments.settings))
+
+
+def spare_compiling(config: Config, n_scans: int, *, quiet: bool = False) -> Config:
+    """Return parameters with the backend that is done first, where `config` leaves it open.
+
+    With numpy a scan takes some 0.1 s longer, and compiling takes some 30 s: it pays from
+    `COMPILING_PAYS` scans on, unless the code is there already.
+    """
+    if config.runtime.backend != 'auto' or n_scans >= COMPILING_PAYS or not has_to_compile():
+        return config
+    if not quiet:
+        note('segmenting with numpy; to have compiled code, run gp-ground-seg warm-up once')
+    return config.replace(**{'runtime.backend': 'numpy'})
 
 
 def named_config(name: str) -> Config:

@@ -104,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
     truth = None
     if arguments.labels is not None:
         truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
-    result = GroundSegmenter(config).segment(points)
+    result = GroundSegmenter(options.spare_compiling(config, 1)).segment(points)
     if arguments.picture == 'scan':
         camera = arguments.camera
         said = plot_scan_view(points, result.label, path, title, camera, truth=truth)

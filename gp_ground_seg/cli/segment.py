@@ -142,6 +142,7 @@ def _segment_to(target: Path, item: Item, arguments: argparse.Namespace, config:
         check_writable(target, force=arguments.force)
     options.note_leftovers(target, quiet=arguments.quiet)
     bar = options.progress('segment', quiet=arguments.quiet)
+    config = options.spare_compiling(config, item.n_clouds, quiet=arguments.quiet)
     results = item.write(GroundSegmenter(config), target.parent)
     _print_summary(Outcome.of(bar(results, total=item.n_clouds)), target)
 
@@ -166,6 +167,9 @@ def _segment_into(
                 # A bag takes long: each is a block by itself, and kept once it is finished.
                 group = attrgetter('path') if arguments.more else None
                 blocks, found = cut(left, group, runner.n_workers), Outcome.of([])
+                config = options.spare_compiling(
+                    config, count_clouds(items), quiet=arguments.quiet
+                )
                 compute = partial(segment_block, folder, config)
                 outcomes = runner.map(compute, blocks, count_clouds)
                 for block, outcome in zip(blocks, outcomes, strict=True):

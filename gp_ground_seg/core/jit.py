@@ -137,7 +137,7 @@ def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _
 def announce_compiling() -> None:
     """Log once, where code is about to run that is not kept on disk, that it is compiled."""
     if _is_missing:
-        _LOGGER.info('compiling for this processor, which takes 10 to 40 s')
+        _LOGGER.info('compiling for this processor, which takes 20 to 60 s')
 
 
 def _njit_kept(function: Callable[..., Any], options: dict[str, Any]) -> Any:
@@ -161,7 +161,7 @@ def _njit_kept(function: Callable[..., Any], options: dict[str, Any]) -> Any:
 @functools.cache
 def _log_not_kept(reason: str) -> None:
     _LOGGER.warning(
-        'compiled code is not kept on disk (%s): every start compiles, which takes 10 to 40 s; '
+        'compiled code is not kept on disk (%s): every start compiles, which takes 20 to 60 s; '
         'set NUMBA_CACHE_DIR to a folder of your own',
         reason,
     )
@@ -240,22 +240,17 @@ def _delete_damaged(folder: Path) -> None:
     _is_warm, _is_missing = is_whole and kept.get('warm') is True, not is_whole
 
 
-def keep_code(*, warm: bool = False) -> None:
-    """Note checksums of the code that numba has kept, so that the next start uses it.
-
-    Parameters
-    ----------
-    warm : bool
-        Whether all code that a frame needs has been compiled.
-    """
+def keep_code() -> None:
+    """Note checksums of the code that numba has kept, so that the next start uses it."""
     global _n_ready, _n_kept, _is_warm
     n_ready = sum(len(entry.overloads) for entry in _entry_points)
     folder = code_folder()
-    if folder is None or (n_ready == _n_ready and not warm):
+    if folder is None or n_ready == _n_ready:
         return
     _n_ready = n_ready
     # Of those the ones that were compiled, not loaded; slow to count.
     n_compiled = sum(len(entry.stats.cache_misses) for entry in _entry_points)
+    warm = _is_whole()
     if n_compiled == _n_kept and (_is_warm or not warm):
         return
     _n_kept, _is_warm = n_compiled, _is_warm or warm
@@ -267,6 +262,16 @@ def keep_code(*, warm: bool = False) -> None:
         _log_not_kept(str(error))
 
 
+def has_to_compile() -> bool:
+    """Whether the first frame in compiled code would take long: none is kept, none is at hand."""
+    return JIT_ENABLED and not (_is_whole() or (code_folder() is not None and _is_warm))
+
+
+def _is_whole() -> bool:
+    """Whether each function that is called from Python is compiled or loaded in this process."""
+    return bool(_entry_points) and all(entry.overloads for entry in _entry_points)
+
+
 def is_code_kept() -> bool:
-    """Whether all code that a frame needs lies on disk; `keep_code` was called with `warm`."""
+    """Whether all code that a frame needs lies on disk."""
     return _is_warm

@@ -302,7 +302,7 @@ def warm_up(config: Config | None = None) -> Backend:
     wall = xyz[25] + [0.0, 0.0, 1.0]
     points = np.concatenate([xyz.reshape(-1, 3), wall]).astype(np.float32)
     segmenter.segment(points)
-    keep_code(warm=True)
+    keep_code()
     return segmenter.backend
 
 

@@ -16,7 +16,7 @@ from gp_ground_seg.core.segmenter import warm_up
 from gp_ground_seg.ros.start_stop import child_command
 
 FOLLOWS = (
-    'segmenting with numpy until the compiled code is there: a second, or 10 to 40 s to compile it'
+    'segmenting with numpy until the compiled code is there: a second, or 20 to 60 s to compile it'
 )
 CHANGED = 'segmenting with numba now'
 STAYS = 'segmenting with numpy from now on'
@@ -78,7 +78,7 @@ class BackendLoader:
         """Stop, and wait for the thread.
 
         A thread that compiles in this process, as where no folder can keep the code, does so for
-        10 to 40 s: nobody waits for it.
+        20 to 60 s: nobody waits for it.
         """
         self.stop()
         if self._thread is not None:
