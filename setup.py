@@ -8,6 +8,7 @@ from setuptools import find_packages, setup
 PACKAGE = 'gp_ground_seg'
 
 BAGS = ['rosbags>=0.11.9']
+EVALUATE = ['pandas>=2.1']
 FORMATS = ['python-neo-lzf>=0.3']
 PLOT = ['matplotlib>=3.6']
 SCALE = ['distributed>=2025.1']  # 21 MB
@@ -24,6 +25,7 @@ TEST = ['hypothesis>=6.100', 'pytest>=7.4']
 DOCS = ['myst-parser>=3', 'sphinx>=7.2', 'sphinx-rtd-theme>=2']
 DEV = [
     *TEST,
+    *EVALUATE,
     *FORMATS,
     *SCALE,
     *VISER,
@@ -79,11 +81,12 @@ setup(
     ],
     extras_require={
         'bags': BAGS,
+        'evaluate': EVALUATE,
         'formats': FORMATS,
         'plot': PLOT,
         'tune': VISER,
         'scale': SCALE,
-        'ros': ROS + BAGS + PLOT,
+        'ros': ROS + BAGS + EVALUATE + PLOT,
         'test': TEST,
         'docs': DOCS,
         'dev': DEV,

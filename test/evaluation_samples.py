@@ -6,6 +6,18 @@ import numpy as np
 
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.lab.scoring.evaluate import MethodResult
+from gp_ground_seg.lab.scoring.frames import Scores, make_scores
+
+
+def scores_of(**methods: list[dict]) -> Scores:
+    """Scores by rows of scans of each method; rows say sequence, index and cluster."""
+    common = {'n_scans': 1, 'seconds': 0.0, 'points': 100, 'n_changed': 0, 'backend': 'numba'}
+    rows = [
+        {'method': name, 'cluster': row['sequence'], **common, **row}
+        for name, its in methods.items()
+        for row in its
+    ]
+    return make_scores([{'scans': rows}])
 
 
 def street(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -94,8 +94,8 @@ def main():
     rates = measure(clouds, given.rates, given.frames, ros_args)
     n_points = sum(map(len, scans)) / len(scans)
     title = f'{given.data or "simulated HDL-64E"}: {len(scans)} clouds of {n_points:.0f} points'
-    rows = [[rate[column.key] for column in COLUMNS] for rate in rates]
-    print(Table([[*zip(COLUMNS, row, strict=True)] for row in rows], title).text())
+    columns = {column: [rate[column.key] for rate in rates] for column in COLUMNS}
+    print(Table(columns, title).text())
     print(machine_line(describe_environment()))
 
 

@@ -1,6 +1,5 @@
 """Time per frame: alternation, ratios, record; the command `bench` on real files."""
 
-import dataclasses
 import itertools
 import json
 import sys
@@ -17,8 +16,9 @@ from hypothesis import strategies as st
 from gp_ground_seg import Config
 from gp_ground_seg.cli.bench import RUN_LENGTH, bench_text, load_frames, read_record, runs
 from gp_ground_seg.core.errors import DataError, PointCloudError
-from gp_ground_seg.lab.scoring.benchmark import bench_cases, bench_document, run_cases
-from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, KnownScan, MethodScore
+from gp_ground_seg.lab.scoring.benchmark import BESIDE, bench_cases, bench_document, run_cases
+from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, KnownScan
+from gp_ground_seg.lab.scoring.frames import make_scores
 from gp_ground_seg.lab.scoring.report import describe_environment
 
 QUICK = ('--set', 'grid.n_segments=24')
@@ -66,18 +66,22 @@ def test_every_case_runs_on_every_frame_beside_its_own_baseline():
         'theta fixed, 1 thread', 'learning, 1 thread', 'theta fixed, numpy', 'learning, numpy',
     ]  # fmt: skip
     measured = run_cases(frames, cases, make, n_passes=2, clock=lambda: next(clock))
-    assert list(measured) == list(cases)
-    for ruler, (ours, baseline) in zip(rulers, measured.values(), strict=True):
-        for score in (ours, baseline):
-            assert [(s.sequence, s.index) for s in score.scans] == [
+    pairs = [(name, f'{BESIDE}{name}') for name in cases]
+    assert measured.methods == [*itertools.chain(*pairs)]
+    rows = {name: [row for row in measured.rows['scans'] if row['method'] == name]
+            for name in measured.methods}  # fmt: skip
+    for ruler, (ours, baseline) in zip(rulers, pairs, strict=True):
+        for name in (ours, baseline):
+            assert [(row['sequence'], row['index']) for row in rows[name]] == [
                 (frame.sequence, frame.index) for frame in frames * 2
             ]
         # Its reading of the clock, and seven ticks within.
-        assert {scan.seconds for scan in baseline.scans} == {8}
-        assert {scan.seconds for scan in ours.scans} == {1}
+        assert {row['seconds'] for row in rows[baseline]} == {8}
+        assert {row['seconds'] for row in rows[ours]} == {1}
         # Once to warm up, then on each frame; forgotten at each change of sequence.
-        assert (ruler.journal.count('b'), ruler.journal.count('Rb')) == (1 + 10, 4)
-    modes = [ours.scans[-1].fit.mode for ours, _ in measured.values()]
+        n_runs = len(ruler.journal) - ruler.journal.count(f'R{baseline}')
+        assert (n_runs, len(ruler.journal) - n_runs) == (1 + 10, 4)
+    modes = [rows[ours][-1]['mode'] for ours, _ in pairs]
     assert modes == ['fixed', 'every_frame'] * 2
 
 
@@ -96,15 +100,16 @@ def test_runs_are_spread_and_hold_successive_frames(n_available, n_wanted):
 
 def recorded(ours, peers):
     frames = frames_of(('a', len(ours)), n_points=50)
-    ((score,),) = run_cases(frames, {'only': NUMPY}).values()
-    case = [
-        MethodScore('only', tuple(
-            dataclasses.replace(scan, seconds=a, stages={'grid': 0.25 * a, 'label': 0.5 * a})
-            for scan, a in zip(score.scans, seconds, strict=True)
-        ))
-        for seconds in (ours, peers)
-    ]  # fmt: skip
-    return bench_document({'only': case}, NUMPY, describe_environment(), PATCHWORKPP, 'frames')
+    rows = run_cases(frames, {'only': NUMPY}).rows
+    found = {'scans': [], 'times': []}
+    for name, seconds in (('only', ours), (f'{BESIDE}only', peers)):
+        for row, a in zip(rows['scans'], seconds, strict=True):
+            found['scans'].append({**row, 'method': name, 'seconds': a})
+            stages = {'grid': 0.25 * a, 'label': 0.5 * a}
+            key = {key: row[key] for key in ('sequence', 'index')}
+            found['times'].append({'method': name, **key, **stages})
+    scores = make_scores([found])
+    return bench_document(scores, NUMPY, describe_environment(), PATCHWORKPP, 'frames')
 
 
 def test_ratios_pair_each_frame_with_its_baseline():

@@ -16,7 +16,7 @@ from gp_ground_seg.cli.experiment import EXPERIMENTS
 from gp_ground_seg.cli.options import library_notes
 from gp_ground_seg.core.parameters.removed import PROGRAM, REMOVED
 
-HEAVY = {'numba', 'scipy', 'matplotlib', 'rosbags', 'rclpy'}
+HEAVY = {'numba', 'scipy', 'matplotlib', 'pandas', 'rosbags', 'rclpy'}
 
 
 @pytest.mark.parametrize('name', cli.COMMANDS)

@@ -8,39 +8,49 @@ import numpy as np
 import pytest
 import scipy.stats
 from cli_runner import error_line, run
-from evaluation_samples import street, write_streets
+from evaluation_samples import scores_of, street, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.lab.scoring.comparison import (
-    MEASURES,
+    RMSE,
     clusters,
     difference_interval,
     difference_table,
     interval_note,
     interval_text,
-    mse_sums,
+    iou_measure,
+    measures,
     without_one_table,
 )
-from gp_ground_seg.lab.scoring.evaluate import MethodScore, ScanScore
-from gp_ground_seg.lab.scoring.metrics import Confusion, height_error
-from gp_ground_seg.lab.scoring.objects import SHARES, ObjectCount, Share
+from gp_ground_seg.lab.scoring.metrics import height_sums
+from gp_ground_seg.lab.scoring.objects import SHARES
+
+IOU = iou_measure('g')
 
 
 def sequences_of(*hits, of=100, n_frames=1):
-    """Sequences with `hits` of `of` ground points in each of their frames."""
-    return MethodScore('x', tuple(
-        ScanScore(str(k), str(j), 0.0, confusions={'g': Confusion(n, 0, of - n)})
+    """Rows of sequences with `hits` of `of` ground points in each of their frames."""
+    return [
+        {'sequence': str(k), 'index': str(j), 'g_tp': n, 'g_fp': 0, 'g_fn': of - n, 'g_tn': 0}
         for k, n in enumerate(hits)
         for j in range(n_frames)
-    ))  # fmt: skip
+    ]
 
 
 def heights_of(**errors):
-    """Scans with errors of the height [m], by sequence."""
-    return MethodScore('x', tuple(
-        ScanScore(name, '0', 0.0, height=height_error(np.zeros(len(own)), np.array(own)))
+    """Rows of scans with errors of the height [m], by sequence."""
+    return [
+        {'sequence': name, 'index': '0', **height_sums(np.zeros(len(own)), np.array(own))}
         for name, own in errors.items()
-    ))  # fmt: skip
+    ]
+
+
+def interval(ours, theirs, measure=IOU, rng=None):
+    return difference_interval(scores_of(a=ours, b=theirs), 'b', measure, rng=rng)
+
+
+def text(ours, theirs, measure=IOU):
+    return interval_text(scores_of(a=ours, b=theirs), 'b', measure)
 
 
 def test_interval_is_that_of_all_draws_weighted_alike():
@@ -48,7 +58,7 @@ def test_interval_is_that_of_all_draws_weighted_alike():
     ours, theirs = (90, 70, 50), (80, 71, 20)
     draws = itertools.product(range(3), repeat=3)
     difference = [sum(ours[k] - theirs[k] for k in draw) / 300 for draw in draws]
-    found = difference_interval(sequences_of(*ours), sequences_of(*theirs))
+    found = interval(sequences_of(*ours), sequences_of(*theirs))
     # A draw is of 1 of 27: the ends lie in the lowest and in the highest.
     assert found == pytest.approx((min(difference), max(difference)))
     assert found.is_tie
@@ -56,7 +66,7 @@ def test_interval_is_that_of_all_draws_weighted_alike():
 
 def test_one_sequence_left_out_after_the_other():
     ours, theirs = (90, 70, 50, 60), (80, 71, 20, 55)
-    table = without_one_table(sequences_of(*ours), sequences_of(*theirs))
+    table = without_one_table(scores_of(a=sequences_of(*ours), b=sequences_of(*theirs)), 'b')
     without = [(sum(ours) - a - sum(theirs) + b) / 300 for a, b in zip(ours, theirs, strict=True)]
     found = [row['difference'] for row in table.json()]
     assert found == pytest.approx([*without, (sum(ours) - sum(theirs)) / 400])
@@ -70,84 +80,94 @@ def test_large_clusters_weigh_more_and_scans_of_a_sequence_are_drawn_together():
     """Pooled, as the IoU is: not a mean of ratios; ten equal scans are not ten observations."""
 
     def mixed(large, small):
-        parts = sequences_of(*[large] * 20, of=1000), sequences_of(*[small] * 20, of=10)
-        scans = [
-            *parts[0].scans,
-            *(
-                ScanScore(f'small {s.sequence}', '0', 0.0, confusions=s.confusions)
-                for s in parts[1].scans
-            ),
-        ]
-        return MethodScore('x', tuple(scans))  # fmt: skip
+        rows = sequences_of(*[large] * 20, of=1000)
+        small_ones = sequences_of(*[small] * 20, of=10)
+        return rows + [{**row, 'sequence': f'small {row["sequence"]}'} for row in small_ones]
 
-    low, high = difference_interval(mixed(1000, 0), mixed(900, 10))
+    low, high = interval(mixed(1000, 0), mixed(900, 10))
     assert 0.07 < low < 1800 / 20200 < high < 0.1
     halves, other = (sequences_of(*hits, n_frames=5) for hits in ((60, 40), (50, 50)))
-    assert difference_interval(halves, other) == pytest.approx((-0.1, 0.1))
+    assert interval(halves, other) == pytest.approx((-0.1, 0.1))
 
 
 def test_words():
     ours, theirs = sequences_of(90, 80, 70), sequences_of(80, 75, 71)
-    assert interval_text(ours, theirs) == '-1.00 to +10.00 tie'
-    assert interval_text(ours, sequences_of(80, 75, 60)) == '+5.00 to +10.00'
-    assert interval_text(ours, ours) == '+0.00 to +0.00 tie'
-    assert interval_text(ours.of('0'), theirs.of('0')) is None
-    empty = sequences_of(90, 0, of=90)
-    empty = MethodScore('x', (empty.scans[0], ScanScore('9', '0', 0.0)))
-    assert interval_text(empty, empty) is None
+    assert text(ours, theirs) == '-1.00 to +10.00 tie'
+    assert text(ours, sequences_of(80, 75, 60)) == '+5.00 to +10.00'
+    assert text(ours, ours) == '+0.00 to +0.00 tie'
+    assert text(ours[:1], theirs[:1]) is None
+    # Of a sequence without a scored point the ratio is not known, if it is drawn alone.
+    empty = [sequences_of(90)[0], {**sequences_of(0, of=0)[0], 'sequence': '9'}]
+    assert text(empty, empty) is None
     ours, theirs = heights_of(a=[0.3, 0.3], b=[0.1]), heights_of(a=[0.0, 0.0], b=[0.1])
     # Twice the first: 0.3 - 0; twice the second: no difference.
-    assert difference_interval(ours, theirs, mse_sums) == pytest.approx((0.0, 0.3))
-    assert interval_text(ours, theirs, mse_sums) == '+0.00 to +30.00 tie'
+    assert interval(ours, theirs, RMSE) == pytest.approx((0.0, 0.3))
+    assert text(ours, theirs, RMSE) == '+0.00 to +30.00 tie'
+
+
+def test_rows_of_a_part_are_drawn_by_the_clusters_of_all_scans():
+    """A sequence without a row counts as one without a point: with twelve it is seldom alone."""
+    hits = [*range(60, 72)]
+    ours, theirs = sequences_of(*hits), sequences_of(*reversed(hits))
+    scores = scores_of(a=ours, b=theirs)
+    part = scores.scans[scores.scans['sequence'] != '5']
+    nothing = dict.fromkeys(('g_tp', 'g_fn'), 0)
+    emptied = [[{**row, **nothing} if row['sequence'] == '5' else row for row in its]
+               for its in (ours, theirs)]  # fmt: skip
+    assert difference_interval(scores, 'b', IOU, part) == interval(*emptied)
+    assert difference_interval(scores, 'b', IOU, part) != interval(ours, theirs)
 
 
 def test_it_is_the_same_each_time_and_follows_the_generator_given():
     ours, theirs = sequences_of(*range(50, 62)), sequences_of(*range(61, 49, -1))
     np.random.seed(5)  # noqa: NPY002 - the state that must not matter
-    before = difference_interval(ours, theirs)
+    before = interval(ours, theirs)
     np.random.seed(6)  # noqa: NPY002
-    assert difference_interval(ours, theirs) == before
-    found = [difference_interval(ours, theirs, rng=np.random.default_rng(k)) for k in (1, 2)]
+    assert interval(ours, theirs) == before
+    found = [interval(ours, theirs, rng=np.random.default_rng(k)) for k in (1, 2)]
     assert found[0] != found[1] and found[0] == pytest.approx(found[1], abs=0.01)
 
 
 def test_of_a_single_sequence_blocks_of_successive_frames_are_drawn():
     for n, sizes in ((1, [1]), (9, [9]), (10, [5, 5]), (23, [5, 6, 6, 6]), (500, [50] * 10)):
-        score = sequences_of(50, n_frames=n)
-        parts = clusters(score)
-        assert [len(part.scans) for part in parts] == sizes
-        assert [scan.index for part in parts for scan in part.scans] == [*map(str, range(n))]
+        scores = scores_of(a=sequences_of(50, n_frames=n))
+        parts = clusters(scores)
+        assert parts.groupby('cluster').size().tolist() == sizes
+        assert parts['cluster'].is_monotonic_increasing
+        assert parts['index'].tolist() == [*map(str, range(n))]
         found = 'blocks of successive frames' if n >= 10 else 'they need two sequences'
-        assert found in interval_note(score)
-    scenes = [ScanScore('vlp-16 kerb', str(k), 0.0, cluster=f'kerb {k % 3}') for k in range(6)]
-    score = MethodScore('x', tuple(scenes))
-    assert [[scan.index for scan in part.scans] for part in clusters(score)] == [
-        ['0', '3'], ['1', '4'], ['2', '5'],
-    ]  # fmt: skip
-    assert 'bootstrap over 3 scenes' in interval_note(score)
+        assert found in interval_note(scores)
+    scores = scores_of(a=[
+        {'sequence': 'vlp-16 kerb', 'index': str(k), 'cluster': f'kerb {k % 3}'} for k in range(6)
+    ])  # fmt: skip
+    parts = {name: own.tolist() for name, own in clusters(scores).groupby('cluster')['index']}
+    assert parts == {'kerb 0': ['0', '3'], 'kerb 1': ['1', '4'], 'kerb 2': ['2', '5']}
+    assert 'bootstrap over 3 scenes' in interval_note(scores)
 
 
-def score(*frames, sequences=('00', '08'), n_changed=0):
+def rows_of(*frames, sequences=('00', '08'), n_changed=0):
     """One frame of each sequence; `frames` are hits of 100 ground returns, and errors [m]."""
-    scans = []
+    rows = []
     for sequence, (hits, *errors) in zip(sequences, frames, strict=True):
-        height = height_error(np.zeros(len(errors)), np.array(errors), np.full(len(errors), 0.1))
-        objects = {'person': (ObjectCount(10, 100 - hits, 4, hits % 2),)}
-        shares = {name: Share(50, 100 - hits) for name in SHARES}
-        confusions = {'g': Confusion(hits, 0, 100 - hits)}
-        scans.append(
-            ScanScore(sequence, '0', 1e-3 * hits, {}, confusions, height, objects=objects,
-                      shares=shares, n_points=100, n_changed=n_changed * len(scans))
-        )  # fmt: skip
-    return MethodScore('x', tuple(scans))
+        shares = {f'{name}_n': 50 for name in SHARES}
+        shares |= {f'{name}_wrong': 100 - hits for name in SHARES}
+        rows.append({
+            'sequence': sequence, 'index': '0', 'seconds': 1e-3 * hits,
+            'n_changed': n_changed * len(rows),
+            'g_tp': hits, 'g_fp': 0, 'g_fn': 100 - hits, 'g_tn': 0,
+            **height_sums(np.zeros(len(errors)), np.array(errors), np.full(len(errors), 0.1)),
+            'n_returns': 10, 'n_ground': 100 - hits, 'n_objects': 4, 'n_lost': hits % 2,
+            **shares,
+        })  # fmt: skip
+    return rows
 
 
 def test_differences_by_hand():
-    ours = score((85, 0.1, 0.1), (99, 0.3, 0.1))
-    other = score((80, 0.1, -0.2), (90, 0.0, 0.0), n_changed=30)
-    table = difference_table(ours, other)
+    ours = rows_of((85, 0.1, 0.1), (99, 0.3, 0.1))
+    other = rows_of((80, 0.1, -0.2), (90, 0.0, 0.0), n_changed=30)
+    table = difference_table(scores_of(ours=ours, x=other), 'x')
     rows = {row['measure']: row for row in table.json()}
-    assert list(rows) == [column.title for column, _ in MEASURES]
+    assert list(rows) == [unit.title for unit in measures('g')]
     iou, rmse = rows['IoU [%]'], rows['RMSE of the height [cm]']
     assert (iou['given'], iou['peer'], iou['difference']) == pytest.approx((0.92, 0.85, 0.07))
     # Of two sequences the ends are twice the one and twice the other.
@@ -170,7 +190,7 @@ def test_differences_by_hand():
     assert re.search(r'measure +given +x +difference', table.text())
     assert '92.00   85.00       +7.00  +5.00 to +9.00' in table.text()
     assert table.notes == ['points with two labels: 15.00%; most in 08/0 (30.00%), 00/0 (0.00%)']
-    alone = difference_table(ours.of('00'), other.of('00'))
+    alone = difference_table(scores_of(ours=ours[:1], x=other[:1]), 'x')
     assert 'no intervals: they need two sequences' in alone.title
     assert {row['interval'] for row in alone.json()} == {None}
 

@@ -11,7 +11,7 @@ import numpy as np
 import pypatchworkpp
 import pytest
 from cli_runner import error_line, run
-from evaluation_samples import HeightRule, street, write_frame, write_streets
+from evaluation_samples import HeightRule, scores_of, street, write_frame, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import DataError, MissingDependencyError, PointCloudError
@@ -19,10 +19,11 @@ from gp_ground_seg.core.parameters.config import SensorConfig
 from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab.experiments.variants import SimulatedFrame, load_simulated, peer_of
 from gp_ground_seg.lab.scoring import evaluate as runner
-from gp_ground_seg.lab.scoring import metrics
+from gp_ground_seg.lab.scoring import metrics, tables
+from gp_ground_seg.lab.scoring.comparison import iou_measure
 from gp_ground_seg.lab.scoring.evaluate import OurMethod
-from gp_ground_seg.lab.scoring.metrics import Confusion, height_error
-from gp_ground_seg.lab.scoring.objects import Share
+from gp_ground_seg.lab.scoring.frames import each, make_scores, sums, with_all
+from gp_ground_seg.lab.scoring.metrics import COUNTS, label_ratios
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 
 
@@ -30,29 +31,45 @@ def evaluate(root, *methods, **options):
     return runner.score_methods(labelled_frames(root), methods, **options)
 
 
+def counts(scores, method, convention='groundgrid', frame=None):
+    """TP, FP, FN and TN of a method over all scans."""
+    pooled = sums(scores.scans if frame is None else frame).loc[method]
+    prefix = f'{convention}_' if convention else ''
+    return tuple(pooled[f'{prefix}{name}'] for name in COUNTS)
+
+
+def rows_of(scores, method):
+    return [row for row in scores.rows['scans'] if row['method'] == method]
+
+
 def test_times():
     times = ((0.010, 0.004, 0.001), (0.020, 0.006, 0.003), (0.090, 0.050, 0.002))
-    frames = (
-        runner.ScanScore('00', '0', s, {'grid': grid, 'label': label}) for s, grid, label in times
-    )
-    score = runner.MethodScore('x', tuple(frames))
-    assert (score.seconds(), score.seconds(max)) == (0.020, 0.090)
-    assert score.median_stages == {'grid': 0.006, 'label': 0.002}
-    assert math.isnan(runner.MethodScore('x', ()).seconds())
+    key = {'method': 'x', 'sequence': '00', 'index': '0'}
+    scores = make_scores([{
+        'scans': [{**key, 'seconds': s} for s, *_ in times],
+        'times': [{**key, 'grid': grid, 'label': label} for _, grid, label in times],
+    }])  # fmt: skip
+    assert tables.median_stages(scores, 'x') == {'grid': 0.006, 'label': 0.002}
+    assert tables.median_stages(scores, 'y') == {}
 
 
 def test_pooling_sums_counts_and_does_not_average_ratios():
-    large, small = Confusion(tp=90, fp=10), Confusion(fn=1)
-    score = runner.MethodScore('x', tuple(
-        runner.ScanScore(name, '0', 0.0, {}, {'groundgrid': one})
-        for name, one in (('08', large), ('00', small))
-    ))  # fmt: skip
-    assert score.iou == score.pooled('groundgrid').iou == 90 / 101
-    assert score.of('00').confusion == small
-    assert [name for name, _ in score.by_sequence()] == [*score.sequences, 'all']
-    assert score.sequences == ['08', '00']
-    parts = [score.of('00'), score.of('08')]
-    assert runner.pool('y', parts).confusion == score.confusion
+    large, small = {'g_tp': 90, 'g_fp': 10, 'g_fn': 0}, {'g_tp': 0, 'g_fp': 0, 'g_fn': 1}
+    scores = scores_of(
+        x=[{'sequence': '08', 'index': '0', **large}, {'sequence': '00', 'index': '0', **small}],
+        y=[{'sequence': '08', 'index': '0', **small}, {'sequence': '00', 'index': '0', **small}],
+    )
+    assert (scores.methods, scores.sequences) == (['x', 'y'], ['08', '00'])
+    assert scores.conventions == ['g']
+    assert iou_measure('g').of(sums(scores.scans)).tolist() == [90 / 101, 0.0]
+    by_sequence = sums(with_all(scores.scans), 'sequence')
+    for own in each(by_sequence, scores.methods):
+        assert own.index.tolist() == ['08', '00', 'all']
+    assert by_sequence.loc[('x', 'all'), 'g_tp'] == 90
+    part = scores.of(['x'], ['00'])
+    assert (part.methods, part.sequences, part.scans['g_fn'].tolist()) == (['x'], ['00'], [1])
+    parts = [scores.of(sequences=[name]).rows for name in scores.sequences]
+    assert make_scores(parts).scans.equals(scores.scans)
 
 
 def test_labelled_frames_of_all_and_of_some(tmp_path):
@@ -87,11 +104,11 @@ def test_methods_alternate_after_one_warm_up(tmp_path, each_alone):
     second = ['Rb', 'b', 'Ra', 'a'] if each_alone else ['b', 'a']
     first = ['Ra', 'a', 'Rb', 'b']
     assert journal == ['a', 'b', *first, *second, *first]
-    assert [score.name for score in scores] == ['a', 'b']
-    for score in scores:
+    assert scores.methods == ['a', 'b']
+    for name in scores.methods:
         # The clock is read right before and right after.
-        assert [scan.seconds for scan in score.scans] == [1.0] * 3
-        assert [scan.index for scan in score.scans] == ['000000', '000001', '000000']
+        assert [row['seconds'] for row in rows_of(scores, name)] == [1.0] * 3
+        assert [row['index'] for row in rows_of(scores, name)] == ['000000', '000001', '000000']
 
 
 def test_cut_scans_are_a_second_run_that_is_not_timed(tmp_path):
@@ -109,12 +126,17 @@ def test_cut_scans_are_a_second_run_that_is_not_timed(tmp_path):
     cut = load(labelled_frames(tmp_path)[0]).cut
     assert 50 < cut.is_low.sum() < (~cut.is_kept).sum() < 900
     n_wrong = int((points[cut.is_low, 2] < -1.5).sum())
-    plain = evaluate(tmp_path, rules[0])[0]
-    for score in scores:
-        assert [scan.seconds for scan in score.scans] == [1.0] * 3
-        # Such a rule has no heights, and so no false cells.
-        assert score.shares == {'low_things': Share(3 * int(cut.is_low.sum()), 3 * n_wrong)}
-        assert score.confusion == plain.confusion and plain.shares == {}
+    plain = evaluate(tmp_path, rules[0])
+    pooled = sums(scores.scans)
+    for name in scores.methods:
+        assert [row['seconds'] for row in rows_of(scores, name)] == [1.0] * 3
+        own = pooled.loc[name]
+        assert own['low_things_n'] == 3 * cut.is_low.sum()
+        assert own['low_things_wrong'] == 3 * n_wrong
+        assert counts(scores, name) == counts(plain, 'a')
+    # Such a rule has no heights, and so no false cells.
+    assert not any('cells' in name or 'low_things' in name for name in plain.scans)
+    assert not any('cells' in name for name in scores.scans)
 
 
 class Learner(HeightRule):
@@ -133,27 +155,30 @@ class Learner(HeightRule):
 def test_what_a_method_learns_from_cut_scans_it_does_not_know_in_whole_ones(tmp_path):
     write_streets(tmp_path, s00=3)
     plain, cut = (
-        evaluate(tmp_path, Learner('a', -1.75), load=partial(runner.load_kitti, cut=height))[0]
+        evaluate(tmp_path, Learner('a', -1.75), load=partial(runner.load_kitti, cut=height)).scans
         for height in (0.0, 0.45)
     )
-    assert [s.confusions for s in plain.scans] == [s.confusions for s in cut.scans]
-    assert len({s.confusion.fp for s in plain.scans}) == 3
-    assert 'low_things' in cut.scans[-1].shares
+    names = [name for name in plain if name.endswith(('_tp', '_fp', '_fn', '_tn'))]
+    assert plain[names].equals(cut[names]) and len(names) == 8
+    assert plain['groundgrid_fp'].nunique() == 3
+    assert 'low_things_n' in cut and 'low_things_n' not in plain
 
 
 def test_scores_of_a_rule_known_by_hand(tmp_path):
     write_streets(tmp_path, s00=1)
     points, semantic = street()
     low = points[:, 2] < -1.5
-    (score,) = evaluate(tmp_path, HeightRule('rule', -1.5))
+    scores = evaluate(tmp_path, HeightRule('rule', -1.5))
     road, wall, tree = semantic == 40, semantic == 50, semantic == 70
     n_road, n_false, n_right = (int(x.sum()) for x in (road, wall & low, wall & ~low))
-    assert score.pooled('groundgrid') == Confusion(n_road, n_false, 0, n_right)
+    assert counts(scores, 'rule') == (n_road, n_false, 0, n_right)
     assert (tree & (points[:, 2] < -1.2975)).sum() == 200
-    assert score.pooled('patchwork') == Confusion(n_road + 200, n_false, 0, n_right + 300)
+    patchwork = counts(scores, 'rule', 'patchwork')
+    assert patchwork == (n_road + 200, n_false, 0, n_right + 300)
     # The rule has a surface at its height.
-    expected = height_error(points[road, 2].astype(float), np.full(n_road, -1.5))
-    assert score.height == expected
+    expected = metrics.height_sums(points[road, 2].astype(float), np.full(n_road, -1.5))
+    (row,) = scores.rows['scans']
+    assert {name: row[name] for name in expected} == expected
 
 
 class GuessedProbabilities(HeightRule):
@@ -166,14 +191,15 @@ class GuessedProbabilities(HeightRule):
 def test_errors_of_rings_are_all_errors_and_sequences_are_pooled(tmp_path):
     write_streets(tmp_path, s00=2, s08=1)
     rules = HeightRule('misses', -1.72), GuessedProbabilities('invents', -1.0)
-    misses, invents = evaluate(tmp_path, *rules)
-    assert misses.confusion.fn > 0 and invents.confusion.fp > 0
-    for score in (misses, invents):
-        assert sum((ring.confusion for ring in score.rings), Confusion()) == score.confusion
-    assert misses.calibration.n_total == 0
-    parts, pooled = [invents.of(s).calibration for s in ('00', '08')], invents.calibration
-    n_scored = sum(ring.confusion.points for ring in invents.rings)
-    assert pooled.n_total == sum(part.n_total for part in parts) == n_scored
+    scores = evaluate(tmp_path, *rules)
+    pooled = sums(scores.scans)
+    assert pooled.loc['misses', 'groundgrid_fn'] > 0 and pooled.loc['invents', 'groundgrid_fp'] > 0
+    for name in scores.methods:
+        assert counts(scores, name, '', scores.rings) == counts(scores, name)
+    assert set(scores.bins['method']) == {'invents'}
+    by_sequence = scores.bins.groupby('sequence')['n'].sum()
+    n_scored = sum(counts(scores, 'invents'))
+    assert by_sequence.sum() == n_scored and (by_sequence > 0).tolist() == [True, True]
 
 
 def test_data_that_does_not_fit_is_an_error_and_a_refused_scan_is_named(tmp_path):
@@ -191,21 +217,34 @@ def test_data_that_does_not_fit_is_an_error_and_a_refused_scan_is_named(tmp_path
 
 def test_ours_is_the_library(tmp_path):
     write_streets(tmp_path, s00=2)
-    (score,) = evaluate(tmp_path, OurMethod(Config()))
+    scores = evaluate(tmp_path, OurMethod(Config()))
     segmenter = GroundSegmenter()
-    for frame, scored in zip(labelled_frames(tmp_path), score.scans, strict=True):
-        scan = runner.load_kitti(frame)
+    stages = scores.times.drop(columns=['method', 'sequence', 'index'])
+    for k, frame in enumerate(labelled_frames(tmp_path)):
+        scored, scan = scores.rows['scans'][k], runner.load_kitti(frame)
         result = segmenter.segment(scan.points)
         for key, truth in scan.truths.items():
-            assert scored.confusions[key] == metrics.count_confusion(result.label, truth)
+            expected = metrics.count_labels(result.label, truth)
+            assert {name: scored[f'{key}_{name}'] for name in COUNTS} == expected
         ground = scan.truths['groundgrid'] == Label.GROUND
         error = (result.ground_z - scan.points[:, 2])[ground]
         error = error[np.isfinite(error)]
-        assert scored.height.rmse == pytest.approx(np.sqrt(np.mean(error**2)))
-        assert scored.height.median_absolute == pytest.approx(np.median(np.abs(error)))
-        assert 'total' not in scored.stages
-        assert 0.0 < sum(scored.stages.values()) <= scored.seconds
-        assert scored.pose.height == result.pose.height
+        rmse = metrics.height_ratios(scored)['rmse']
+        assert rmse == pytest.approx(np.sqrt(np.mean(error**2)))
+        assert scored['median_absolute'] == pytest.approx(np.median(np.abs(error)))
+        assert 'total' not in stages
+        assert 0.0 < stages.iloc[k].sum() <= scored['seconds']
+        assert scored['sensor_height'] == result.pose.height
+
+
+def test_without_pandas_it_is_said_before_any_frame_is_read(tmp_path, monkeypatch, capsys):
+    write_streets(tmp_path, s00=1)
+    monkeypatch.setitem(sys.modules, 'pandas', None)
+    monkeypatch.setattr(runner, 'read_points', None)
+    for words in (['evaluate', tmp_path], ['experiment', 'steps', tmp_path, '--no-peer']):
+        assert run(*words) == 2
+        line = error_line(capsys)
+        assert line.startswith('pandas is not installed') and 'pip install pandas' in line
 
 
 def test_a_missing_peer_is_said(monkeypatch):
@@ -265,9 +304,10 @@ def test_patchworkpp_on_real_frames_scores_as_measured_elsewhere(kitti):
     """A check of our scoring by a number that is not ours: 95.15 % on these 60 frames."""
     frames = labelled_frames(kitti, ['00', '01', '03', '05', '08', '10'])
     frames = [frame for frame in frames if int(frame.index) < 10]
-    (score,) = runner.score_methods(frames, [PatchworkppMethod()])
-    assert len(score.scans) == 60
-    assert score.pooled('groundgrid').iou == pytest.approx(0.9515, abs=0.001)
+    scores = runner.score_methods(frames, [PatchworkppMethod()])
+    assert len(scores.scans) == 60
+    (iou,) = iou_measure('groundgrid').of(sums(scores.scans))
+    assert iou == pytest.approx(0.9515, abs=0.001)
 
 
 @pytest.fixture(scope='module')
@@ -295,24 +335,23 @@ def test_tables_hold_the_sums_of_the_frames(root, evaluated, capfd):
     frames = document['rows']
     for key, name in itertools.product(('groundgrid', 'patchwork'), ('00', '08', 'all')):
         ours, its = (
-            Confusion(*(
-                sum(f[f'{key}_{n}'] for f in frames
-                    if f['method'] == method and name in (f['sequence'], 'all'))
-                for n in ('tp', 'fp', 'fn', 'tn')
-            ))
+            label_ratios({
+                n: sum(f[f'{key}_{n}'] for f in frames
+                          if f['method'] == method and name in (f['sequence'], 'all'))
+                for n in COUNTS
+            })
             for method in ('gp_ground_seg', 'patchworkpp')
         )  # fmt: skip
         (row,) = (row for row in document[key] if row['sequence'] == name)
         assert row['frames'] == {'00': 2, '08': 1, 'all': 3}[name]
-        assert [row[ratio] for ratio in metrics.RATIOS] == [
-            getattr(ours, ratio) for ratio in metrics.RATIOS
-        ]
-        assert row['patchworkpp_iou'] == its.iou
-        assert row['difference_to_patchworkpp'] == ours.iou - its.iou
-        shown = f'{100 * ours.iou:.2f}  {100 * its.iou:15.2f}  {100 * (ours.iou - its.iou):+10.2f}'
+        assert {ratio: row[ratio] for ratio in ours} == ours
+        assert row['patchworkpp_iou'] == its['iou']
+        difference = ours['iou'] - its['iou']
+        assert row['difference_to_patchworkpp'] == difference
+        shown = f'{100 * ours["iou"]:.2f}  {100 * its["iou"]:15.2f}  {100 * difference:+10.2f}'
         assert any(line.startswith(name) and line.endswith(shown) for line in lines)
-    *_, sums, theirs, last = lines
-    assert sums == '3 frames of 2 sequences; GroundGrid convention; median time of a frame'
+    *_, counted, theirs, last = lines
+    assert counted == '3 frames of 2 sequences; GroundGrid convention; median time of a frame'
     assert theirs.startswith('Patchwork++: IoU ')
     ours = document['groundgrid'][-1]
     names = {'IoU': 'iou', 'precision': 'precision', 'recall': 'recall'}

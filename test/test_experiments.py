@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from evaluation_samples import write_streets
+from evaluation_samples import scores_of, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
@@ -13,12 +13,15 @@ from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab.experiments import ablation, interpolation, scenes, variants
 from gp_ground_seg.lab.experiments.ablation import MODELS
 from gp_ground_seg.lab.scoring import evaluate as runner
-from gp_ground_seg.lab.scoring.evaluate import MethodScore, ScanScore
-from gp_ground_seg.lab.scoring.metrics import Confusion, count_confusion, height_error
+from gp_ground_seg.lab.scoring.metrics import count_labels, height_sums, label_ratios
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, Kind, simulate_scan
 
 FIXED = Config().replace(**{'learning.mode': 'fixed'})
+
+
+def iou_of(label, truth):
+    return label_ratios(count_labels(label, truth))['iou']
 
 
 @pytest.fixture(scope='module')
@@ -34,8 +37,11 @@ def test_models_are_what_their_names_say_and_each_way_to_learn_gives_a_theta(fra
         assert (config.learning.mode == 'fixed') == ('not learned' in title)
     # The last one is the paper's method.
     assert config == Config().replace(**{'learning.fixed': 'none'})
-    scores = variants.score_variants(frames[:1], configs)
-    theta = {score.name: tuple(score.scans[-1].fit.theta.values()) for score in scores}
+    points = runner.load_kitti(frames[0]).points
+    theta = {
+        name: tuple(GroundSegmenter(config).segment(points).fit.theta.values())
+        for name, config in configs.items()
+    }
     assert len(set(theta.values())) == len(MODELS) - 2
     assert len({values for name, values in theta.items() if 'not learned' in name}) == 1
 
@@ -81,7 +87,7 @@ def test_interpolation_has_the_median_of_three_segments_and_our_labels(frames):
     expected = np.median(lines, axis=0)[far]
     np.testing.assert_allclose(surface.mean[segment][far], expected, atol=1e-9)
     assert result.fit.mode == 'fixed'
-    assert count_confusion(result.label, scan.truths['groundgrid']).iou > 0.9
+    assert iou_of(result.label, scan.truths['groundgrid']) > 0.9
 
 
 def test_scenes_without_a_free_lane_are_seen_from_the_origin_only():
@@ -114,8 +120,8 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
     }
     for prefix, label in labels.items():
         is_ground = label == Label.GROUND
-        assert row[f'{prefix}iou'] == count_confusion(
-            label, np.where(made.is_ground, Label.GROUND, Label.OBSTACLE)).iou  # fmt: skip
+        truth = np.where(made.is_ground, Label.GROUND, Label.OBSTACLE)
+        assert row[f'{prefix}iou'] == iou_of(label, truth)
         for title, kinds in (('vehicles', [Kind.BOX]), ('persons', [Kind.PERSON, Kind.CYCLIST])):
             own = np.isin(made.kind, kinds) & high
             parts = [own & (made.object_id == k) for k in range(1, made.object_id.max() + 1)]
@@ -184,7 +190,7 @@ def test_rough_ground_is_a_mean_over_the_sensors_of_ours_with_and_without_the_he
         }
         assert results['told_'].pose.height == height
         for who, result in results.items():
-            iou = count_confusion(result.label, truth).iou
+            iou = iou_of(result.label, truth)
             error = (result.ground_z - made.ground_z)[ground]
             found.setdefault((scene, who), []).append((iou, np.sqrt(np.nanmean(error**2))))
     rows = {row['scene']: row for row in report.tables['rough'].json()}
@@ -207,15 +213,15 @@ def test_rough_ground_is_a_mean_over_the_sensors_of_ours_with_and_without_the_he
 def test_scenes_by_hand_and_behind_is_said():
     """Scores are those of each scan as `test_lost_objects_follow_their_definitions` has them."""
 
-    def score(*ious, error):
-        height = height_error(np.zeros(4), np.array([error, error, -3.0 * error, np.nan]))
-        return MethodScore('x', tuple(
-            ScanScore(f'vlp-16 {name}', '', 0.1, confusions={'e': Confusion(iou, 100 - iou)},
-                      height=height)
+    def rows(*ious, error):
+        height = height_sums(np.zeros(4), np.array([error, error, -3.0 * error, np.nan]))
+        return [
+            {'sequence': f'vlp-16 {name}', 'index': '', **height,
+             'exact_tp': iou, 'exact_fp': 100 - iou, 'exact_fn': 0, 'exact_tn': 0}
             for name, iou in zip(('flat', 'ramp', 'kerb'), ious, strict=True)
-        ))  # fmt: skip
+        ]  # fmt: skip
 
-    scores = [score(90, 80, 70, error=0.1), score(89, 81, 70, error=0.2)]
+    scores = scores_of(y=rows(90, 80, 70, error=0.1), x=rows(89, 81, 70, error=0.2))
     table = scenes.scene_table(scores)
     (note,) = table.notes
     assert note == 'ahead of x on 1 of 3 rows; behind on vlp-16 ramp, vlp-16 kerb'

@@ -39,14 +39,17 @@ def test_iou_on_labelled_frames(kitti):
 def test_no_person_is_lost_and_near_vehicles_are_obstacles(kitti):
     frames = [frame for one in list_sequences(kitti) for frame in list_frames(kitti, one)]
     ours = runner.OurMethod(Config())
-    (score,) = runner.score_methods(frames, [ours])
+    found = (
+        runner.score_methods(frames, [ours])
+        .objects.groupby(['class', 'range'])
+        .sum(numeric_only=True)
+    )
     for name in ('person', 'cyclist'):
-        found = score.objects[name]
-        assert sum(band.n_objects for band in found) > 10
-        assert sum(band.n_lost for band in found) == 0, name
-    near = score.objects['vehicle'][0]
-    assert near.n_returns > 50_000 and near.n_lost == 0
-    assert near.share_ground < 0.002
+        assert found.loc[name, 'n_objects'].sum() > 10
+        assert found.loc[name, 'n_lost'].sum() == 0, name
+    near = found.loc[('vehicle', '0-10 m')]
+    assert near['n_returns'] > 50_000 and near['n_lost'] == 0
+    assert near['n_ground'] < 0.002 * near['n_returns']
 
 
 def test_the_tolerance_trades_precision_for_recall(kitti):

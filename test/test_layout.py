@@ -49,6 +49,7 @@ ONLY_IN = {
     **dict.fromkeys(('dask', 'distributed'), ('lab/scale/cluster.py',)),
     'lzf': ('data/pcd.py',),
     'matplotlib': ('lab/plotting/',),
+    'pandas': ('lab/scoring/', 'lab/experiments/'),
     'numba': ('core/jit.py', 'core/compiled/'),
     'viser': ('lab/viewers/html_page.py',),
     'pypatchworkpp': ('lab/scoring/patchworkpp.py',),

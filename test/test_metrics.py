@@ -4,6 +4,7 @@ import itertools
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.stats
 from hypothesis import given
@@ -14,7 +15,7 @@ from sklearn.calibration import calibration_curve
 from gp_ground_seg import Label
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.lab.scoring import metrics
-from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Confusion
+from gp_ground_seg.lab.scoring.metrics import COUNTS, GROUNDGRID, height_ratios, label_ratios
 
 GROUND_NUMBERS = {40, 44, 48, 49, 60, 72}
 ANY_LABEL = st.sampled_from([0, 1, 2])
@@ -42,14 +43,26 @@ def test_vegetation_by_convention_and_unknown_numbers():
 
 
 def test_ratios_by_hand():
-    confusion = Confusion(tp=6, fp=2, fn=4, tn=8)
-    assert (confusion.precision, confusion.recall, confusion.iou) == (6 / 8, 6 / 10, 6 / 12)
-    assert confusion.f1 == pytest.approx(2 * 0.75 * 0.6 / 1.35)
-    assert confusion.accuracy == 14 / 20
-    assert all(math.isnan(getattr(Confusion(), name)) for name in metrics.RATIOS)
-    only_obstacles = Confusion(tn=5)
-    assert math.isnan(only_obstacles.iou)
-    assert only_obstacles.accuracy == 1.0
+    counts = {'tp': [6, 0, 0], 'fp': [2, 0, 0], 'fn': [4, 0, 0], 'tn': [8, 0, 5]}
+    rows = [dict(zip(counts, row, strict=True)) for row in zip(*counts.values(), strict=True)]
+    found, nothing, only_obstacles = map(label_ratios, rows)
+    assert (found['precision'], found['recall'], found['iou']) == (6 / 8, 6 / 10, 6 / 12)
+    assert found['f1'] == pytest.approx(2 * 0.75 * 0.6 / 1.35)
+    assert found['accuracy'] == 14 / 20
+    assert all(map(math.isnan, nothing.values())) and len(nothing) == 5
+    assert math.isnan(only_obstacles['iou'])
+    assert only_obstacles['accuracy'] == 1.0
+    # Of a frame, row by row the same.
+    of_frame = label_ratios(pd.DataFrame(counts).add_prefix('a_'), 'a_')
+    for name, values in of_frame.items():
+        expected = [found[name], nothing[name], only_obstacles[name]]
+        np.testing.assert_array_equal(values, expected)
+
+
+def test_a_ratio_over_nothing_is_not_known():
+    assert math.isnan(metrics.ratio(3.0, 0.0)) and metrics.ratio(1, 4) == 0.25
+    found = metrics.ratio(pd.Series([1, 2, 0]), pd.Series([2, 0, 0]))
+    np.testing.assert_array_equal(found, [0.5, math.nan, math.nan])
 
 
 @given(ANY_LABELS, st.data())
@@ -60,7 +73,8 @@ def test_counts_against_a_loop(label, data):
         if true_label != Label.UNKNOWN:  # an unknown label is scored as an obstacle
             counts[given_label == Label.GROUND, true_label == Label.GROUND] += 1
     pairs = ((True, True), (True, False), (False, True), (False, False))
-    assert metrics.count_confusion(label, truth) == Confusion(*(counts[pair] for pair in pairs))
+    expected = dict(zip(COUNTS, (counts[pair] for pair in pairs), strict=True))
+    assert metrics.count_labels(label, truth) == expected
 
 
 POINTS = hnp.arrays(
@@ -71,21 +85,23 @@ POINTS = hnp.arrays(
 @given(POINTS, st.data())
 def test_rings_against_a_loop(xy, data):
     label, truth = (data.draw(hnp.arrays(np.uint8, len(xy), elements=ANY_LABEL)) for _ in 'ab')
-    rings = metrics.count_rings(label, truth, xy)
-    assert len(rings) == len(metrics.RING_TITLES) == len(metrics.RING_EDGES) - 1
+    *rings, outside = metrics.count_rings(label, truth, xy)
+    assert [ring.pop('range') for ring in rings] == [*metrics.RING_TITLES]
+    assert len(rings) == len(metrics.RING_EDGES) - 1
+    assert outside == {'range': metrics.NO_RING, **dict.fromkeys(COUNTS, 0)}
     for k, ring in enumerate(rings):
         reach = [math.hypot(*map(float, p)) for p in xy]
         inside = np.array(
             [metrics.RING_EDGES[k] <= r < metrics.RING_EDGES[k + 1] for r in reach], bool
         )
-        assert ring == metrics.count_confusion(label[inside], truth[inside])
-    assert sum(rings, Confusion()) == metrics.count_confusion(label, truth)
+        assert ring == metrics.count_labels(label[inside], truth[inside])
 
 
 def test_rings_hold_their_inner_edge_and_no_point_without_a_range():
     xy = np.array([[0, 0], [10, 0], [0, -50], [3e3, 0], [np.nan, 1], [np.inf, 0]], np.float32)
     ones = np.ones(6, dtype=np.uint8)
-    assert [ring.tp for ring in metrics.count_rings(ones, ones, xy)] == [1, 1, 0, 0, 0, 2]
+    # The last two have none.
+    assert [ring['tp'] for ring in metrics.count_rings(ones, ones, xy)] == [1, 1, 0, 0, 0, 2, 2]
     assert (metrics.RING_TITLES[0], metrics.RING_TITLES[-1]) == ('0-10 m', '> 50 m')
 
 
@@ -115,14 +131,19 @@ def slow(p, truth):
 @given(st.integers(0, 40), st.integers(0, 40), st.data())
 def test_probabilities_against_a_loop_and_those_of_frames_add_up(n, m, data):
     (p, truth), (q, other) = draw(data, n), draw(data, m)
-    found = metrics.count_calibration(p, truth) + metrics.count_calibration(q, other)
+    found = bins(p, truth) + bins(q, other)
     p, truth = np.concatenate([p, q]), np.concatenate([truth, other])
-    assert found.ece == pytest.approx(slow(p, truth), nan_ok=True, abs=1e-12)
-    assert found.n_total == ((truth != Label.UNKNOWN) & ~np.isnan(p)).sum()
-    both = metrics.count_calibration(p, truth)
-    assert (found.n_points.tolist(), found.n_ground.tolist()) == (
-        both.n_points.tolist(), both.n_ground.tolist(),
-    )  # fmt: skip
+    expected = slow(p, truth)
+    assert metrics.calibration_error(found) == pytest.approx(expected, nan_ok=True, abs=1e-12)
+    assert found['n'].sum() == ((truth != Label.UNKNOWN) & ~np.isnan(p)).sum()
+    both, whole = bins(p, truth), ['n', 'n_ground']
+    np.testing.assert_array_equal(found[whole], both[whole])
+
+
+def bins(p, truth):
+    rows = metrics.count_bins(p, truth)
+    assert [row['bin'] for row in rows] == [*range(metrics.N_BINS)]
+    return pd.DataFrame(rows).set_index('bin')
 
 
 def synthetic(n=20_000, seed=0, power=1.0):
@@ -136,53 +157,44 @@ def synthetic(n=20_000, seed=0, power=1.0):
 @pytest.mark.parametrize('power', [1.0, 3.0])
 def test_probabilities_against_scikit_learn(power):
     p, truth = synthetic(power=power)
-    found, ground = metrics.count_calibration(p, truth), truth == Label.GROUND
+    found, ground = bins(p, truth), truth == Label.GROUND
     share, mean = calibration_curve(ground, p.astype(float), n_bins=metrics.N_BINS)
-    np.testing.assert_allclose(found.by_bin(found.sum_p), mean, rtol=1e-9)
-    np.testing.assert_allclose(found.by_bin(found.n_ground), share, rtol=1e-9)
+    np.testing.assert_allclose(found['p'] / found['n'], mean, rtol=1e-9)
+    np.testing.assert_allclose(found['n_ground'] / found['n'], share, rtol=1e-9)
 
 
 @pytest.mark.parametrize('p', [[0.5, 1.01], [-0.01, 0.5], [0.5, np.inf], [0.5]])
 def test_what_is_no_probability_is_refused(p):
     with pytest.raises(PointCloudError, match='p_ground'):
-        metrics.count_calibration(np.array(p), np.array([1, 2], dtype=np.uint8))
+        metrics.count_bins(np.array(p), np.array([1, 2], dtype=np.uint8))
 
 
 def test_height_error_by_hand():
-    error = metrics.height_error(np.array([0.0, 1.0, 2.0, 5.0]), np.array([0.5, 1.0, 1.0, np.nan]))
-    assert (error.n_points, error.n_without_model) == (3, 1)
-    assert error.rmse == pytest.approx(math.sqrt(1.25 / 3))
-    assert error.bias == pytest.approx(-0.5 / 3)
-    assert error.median_absolute == 0.5
-    assert error.smse == pytest.approx((1.25 / 3) / (2 / 3))
+    sums = metrics.height_sums(np.array([0.0, 1.0, 2.0, 5.0]), np.array([0.5, 1.0, 1.0, np.nan]))
+    found = height_ratios(sums)
+    assert (sums['n_points'], sums['n_without_model']) == (3, 1)
+    assert found['rmse'] == pytest.approx(math.sqrt(1.25 / 3))
+    assert found['bias'] == pytest.approx(-0.5 / 3)
+    assert sums['median_absolute'] == 0.5
+    assert found['smse'] == pytest.approx((1.25 / 3) / (2 / 3))
 
 
-@pytest.mark.parametrize(
-    'error',
-    [
-        metrics.height_error(np.empty(0), np.empty(0)),
-        metrics.height_error(np.ones(2), np.full(2, np.nan)),
-        metrics.HeightError(),
-    ],
-)
-def test_height_error_of_nothing(error):
-    assert error.n_points == 0
-    names = ('rmse', 'bias', 'smse', 'median_absolute', 'within_1', 'nlpd')
-    assert all(math.isnan(getattr(error, name)) for name in names)
+@pytest.mark.parametrize('n', [0, 2])
+def test_height_error_of_nothing(n):
+    sums = metrics.height_sums(np.ones(n), np.full(n, np.nan))
+    assert (sums['n_points'], sums['n_without_model']) == (0, n)
+    found = height_ratios(sums)
+    assert set(found) == {'rmse', 'bias', 'smse', 'within_1', 'within_2', 'nlpd'}
+    assert all(map(math.isnan, [*found.values(), sums['median_absolute']]))
 
 
 def test_a_few_returns_far_below_the_ground_do_not_decide_the_density():
-    """Of a frame, however few points its parts by range have."""
     frame = np.random.default_rng(0).normal(0.0, 0.05, 8000)
     frame[-7:] = -6.5
-    truth, std, far = np.zeros(8000), np.full(8000, 0.05), slice(7990, 8000)
-    whole = metrics.height_error(truth, frame, std)
+    found = height_ratios(metrics.height_sums(np.zeros(8000), frame, np.full(8000, 0.05)))
     expected = -np.mean(scipy.stats.norm.logpdf(frame[:-7], 0.0, 0.05))
-    assert whole.nlpd == pytest.approx(expected, abs=0.01)
-    assert whole.rmse > 0.1
-    limit = metrics.largest_nlpd(metrics.negative_log_density(frame, std))
-    assert metrics.height_error(truth[far], frame[far], std[far], limit).nlpd < 0.0
-    assert metrics.height_error(truth[far], frame[far], std[far]).nlpd > 1000.0
+    assert found['nlpd'] == pytest.approx(expected, abs=0.01)
+    assert found['rmse'] > 0.1
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 30), st.integers(2, 5000))
@@ -192,19 +204,20 @@ def test_pooled_height_errors_are_those_of_all_points(seed, n, m):
     error = rng.normal(rng.uniform(-0.1, 0.1), std * rng.uniform(0.5, 2.0))
     error[3::10] = np.nan
     parts = slice(None, n), slice(n, None)
-    found = (metrics.height_error(truth[k], (truth + error)[k], std[k]) for k in parts)
-    pooled = sum(found, metrics.HeightError())
+    found = [metrics.height_sums(truth[k], (truth + error)[k], std[k]) for k in parts]
+    sums = pd.DataFrame(found).sum()
+    pooled = height_ratios(sums)
     known = np.isfinite(error)
     e, s = error[known], std[known]
-    assert (pooled.n_points, pooled.n_without_model) == (known.sum(), (~known).sum())
-    assert pooled.rmse == pytest.approx(np.sqrt(np.mean(e**2)))
-    assert pooled.bias == pytest.approx(e.mean())
-    assert pooled.within_1 == np.mean(np.abs(e) <= s)
-    assert pooled.within_2 == np.mean(np.abs(e) <= 2.0 * s)
+    assert (sums['n_points'], sums['n_without_model']) == (known.sum(), (~known).sum())
+    assert pooled['rmse'] == pytest.approx(np.sqrt(np.mean(e**2)))
+    assert pooled['bias'] == pytest.approx(e.mean())
+    assert pooled['within_1'] == np.mean(np.abs(e) <= s)
+    assert pooled['within_2'] == np.mean(np.abs(e) <= 2.0 * s)
     # Of each part the worst 0.1 % do not count.
     nlpd = -scipy.stats.norm.logpdf(error, 0.0, std)
     best = [np.sort(nlpd[k][known[k]])[: known[k].sum() - known[k].sum() // 1000] for k in parts]
-    assert pooled.nlpd == pytest.approx(np.mean(np.concatenate(best)))
+    assert pooled['nlpd'] == pytest.approx(np.mean(np.concatenate(best)))
     spread = sum(known[k].sum() * np.var(truth[k][known[k]]) for k in parts)
     if spread > 1e-6:
-        assert pooled.smse == pytest.approx((e**2).sum() / spread, rel=1e-6)
+        assert pooled['smse'] == pytest.approx((e**2).sum() / spread, rel=1e-6)

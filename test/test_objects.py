@@ -19,20 +19,18 @@ from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.lab.scoring.metrics import GROUND_CLASSES
 from gp_ground_seg.lab.scoring.objects import (
     BAND_EDGES,
+    BAND_TITLES,
     CLASSES,
     LOW_CLASSES,
     MIN_HEIGHT,
     MIN_RETURNS,
-    ObjectCount,
+    OBJECT_COUNTS,
     Objects,
-    Share,
     count_false_cells,
     count_objects,
     cut_objects,
     labelled_objects,
     local_ground,
-    pool_objects,
-    pool_shares,
 )
 
 
@@ -50,8 +48,8 @@ def count(rows):
 
 
 def of(counts, name, band):
-    one = counts[name][band]
-    return (one.n_returns, one.n_ground, one.n_objects, one.n_lost)
+    (one,) = (row for row in counts if (row['class'], row['range']) == (name, BAND_TITLES[band]))
+    return tuple(one[key] for key in OBJECT_COUNTS[:4])
 
 
 def test_a_return_is_in_the_band_of_its_range_and_an_object_in_that_of_the_median():
@@ -59,16 +57,15 @@ def test_a_return_is_in_the_band_of_its_range_and_an_object_in_that_of_the_media
     assert of(counts, 'vehicle', 0) == (11, 11, 1, 1)
     assert of(counts, 'vehicle', 1) == (10, 0, 0, 0)
     assert of(count(returns(10, 4000.0)), 'vehicle', 3) == (10, 0, 1, 0)
-    assert count(returns(20, math.inf)) == count(returns(20, 5.0, kind=-1)) == {}
+    assert count(returns(20, math.inf)) == count(returns(20, 5.0, kind=-1)) == []
 
 
-def test_unknown_is_not_ground_and_shares_of_nothing_are_nan():
+def test_unknown_is_not_ground():
     points, ones = np.full((10, 3), 5.0), np.ones(10, dtype=int)
     objects = Objects(0 * ones, ones, 0.0 * ones)
     counts = count_objects(points, np.full(10, Label.UNKNOWN, dtype=np.uint8), objects)
     assert of(counts, 'vehicle', 0) == (10, 0, 1, 0)
-    assert counts['vehicle'][0].share_ground == 0.0
-    assert math.isnan(counts['vehicle'][3].share_ground)
+    assert of(counts, 'vehicle', 3) == (0, 0, 0, 0)
     with pytest.raises(PointCloudError, match=r'object_id of shape \(3,\) for 10 points'):
         count_objects(points, 0 * ones, replace(objects, object_id=ones[:3]))
 
@@ -92,17 +89,18 @@ def counted_by_loops(points, label, objects):
             band = band_of(np.median([reach for reach, _ in its]))
             is_lost = sum(is_ground for _, is_ground in its) > len(its) / 2
             found.setdefault((kind, band), []).append(is_lost)
-    return {
-        name: tuple(
-            ObjectCount(*(
+    return [
+        {'class': name, 'range': title, **dict(zip(OBJECT_COUNTS, (
+            *(
                 number for counted in (share, found)
                 for own in [counted.get((kind, band), [])] for number in (len(own), sum(own))
-            ), unknown.count((kind, band)))
-            for band in range(4)
-        )
+            ),
+            unknown.count((kind, band)),
+        ), strict=True))}
         for kind, name in enumerate(CLASSES)
         if any(k == kind for k, _ in [*share, *unknown])
-    }  # fmt: skip
+        for band, title in enumerate(BAND_TITLES)
+    ]  # fmt: skip
 
 
 def band_of(reach):
@@ -127,17 +125,6 @@ def test_counts_are_those_of_plain_loops_in_any_order(seed, n):
     order = np.random.default_rng(seed).permutation(n)
     mixed = Objects(objects.class_of[order], objects.object_id[order], objects.ground_z[order])
     assert count_objects(points[order], label[order], mixed) == expected
-
-
-def test_counts_of_scans_are_summed_by_class():
-    one = count(returns(10, 5.0, n_ground=10))
-    other = count(returns(12, 5.0, kind=1) + returns(12, 15.0))
-    pooled = pool_objects([other, one, {}])
-    assert [*pooled] == ['vehicle', 'person']
-    assert of(pooled, 'vehicle', 0) == (10, 10, 1, 1)
-    assert of(pooled, 'vehicle', 1) == (12, 0, 1, 0)
-    assert of(pooled, 'person', 0) == (12, 0, 1, 0)
-    assert pool_objects([]) == {}
 
 
 # The local ground.
@@ -242,7 +229,7 @@ def test_objects_are_cut_and_what_counts_is_low_and_near():
     # Labels are of what is left: ground is what lies 0.2 m over it, and so two of four are.
     left = points[cut.is_kept]
     label = np.where(left[:, 2] - (-1.73 - 0.1 * left[:, 0]) < 0.3, Label.GROUND, Label.OBSTACLE)
-    assert cut.count(label.astype(np.uint8)) == Share(4, 2)
+    assert cut.count(label.astype(np.uint8)) == {'low_things_n': 4, 'low_things_wrong': 2}
     few = cut_objects(points[5:10], is_object[5:10], ~is_object[5:10], 0.45)
     assert few.is_kept.all() and not few.is_low.any()
 
@@ -267,11 +254,9 @@ def test_false_cells_by_hand():
     x, y, semantic, label, height = np.array(rows, dtype=float).T
     points = np.column_stack([x, y, 0 * x])
     counts = count_false_cells(points, label.astype(np.uint8), height, semantic.astype(int))
-    assert counts == {'road_cells': Share(4, 2), 'ground_cells': Share(6, 3)}
-    pooled = pool_shares([counts, {'low_things': Share(3, 1)}, counts])
-    assert list(pooled) == ['low_things', 'road_cells', 'ground_cells']
-    assert (pooled['road_cells'], pooled['low_things'].ratio) == (Share(8, 4), 1 / 3)
-    assert math.isnan(Share().ratio)
+    assert counts == {
+        'road_cells_n': 4, 'road_cells_wrong': 2, 'ground_cells_n': 6, 'ground_cells_wrong': 3,
+    }  # fmt: skip
 
 
 # The command.
@@ -355,9 +340,11 @@ def test_the_table_of_low_things_is_that_of_the_labels(tmp_path, capsys):
     row, pooled = document['low_things']
     assert {**row, 'sequence': 'all'} == pooled and document['cut'] == 1.0
     ours, peer = document['rows']
-    for name, share in {'low_things': low, **cells}.items():
-        assert (row[name], row[f'{name}_wrong']) == (share.n, share.ratio)
-        assert ours[name] == {'n': share.n, 'n_wrong': share.n_wrong}
+    sums = low | cells
+    for name in ('low_things', 'road_cells', 'ground_cells'):
+        n, n_wrong = sums[f'{name}_n'], sums[f'{name}_wrong']
+        assert (row[name], row[f'{name}_wrong']) == (n, n_wrong / n)
+        assert ours[name] == {'n': n, 'n_wrong': n_wrong}
     # The peer has no heights over a surface.
     assert row['patchworkpp_road_cells_wrong'] is None and 'road_cells' not in peer
     found = peer['low_things']
@@ -368,7 +355,8 @@ def test_the_table_of_low_things_is_that_of_the_labels(tmp_path, capsys):
     )
     none = evaluated(root, tmp_path, '--cut', 0)
     assert set(none['low_things'][0]) == {
-        'sequence', *(f'{name}{end}' for name in cells for end in ('', '_wrong')),
+        'sequence',
+        *(f'{name}{end}' for name in ('road_cells', 'ground_cells') for end in ('', '_wrong')),
     }  # fmt: skip
     assert 'objects that are cut' not in capsys.readouterr().out.replace('\n  ', ' ')
 

@@ -7,6 +7,8 @@ import platform
 import shutil
 import subprocess
 
+import numpy as np
+import pandas as pd
 import pytest
 
 from gp_ground_seg import Config, __version__
@@ -14,19 +16,12 @@ from gp_ground_seg.lab.scoring import report
 from gp_ground_seg.lab.scoring.report import Column, Table
 
 TABLE = Table(
-    [
-        [
-            (Column('sequence', key='name'), name),
-            (Column('points', '_d'), n_points),
-            (Column('IoU [%]', '.2f', 'iou', 100.0), iou),
-            (Column('change [%]', '+.1f', 'change', 100.0), change),
-        ]
-        for name, n_points, iou, change in (
-            ('00', 1234567, 0.9876, -0.001),
-            ('08', 5, math.nan, None),
-            ('all', 1234572, 0.5, 0.25),
-        )
-    ],
+    {
+        Column('sequence', key='name'): ['00', '08', 'all'],
+        Column('points', '_d'): np.array([1234567, 5, 1234572]),
+        Column('IoU [%]', '.2f', 'iou', 100.0): pd.Series([0.9876, math.nan, 0.5]),
+        Column('change [%]', '+.1f', 'change', 100.0): [-0.001, None, 0.25],
+    },
     title='Scores',
     notes=['a note'],
     n_sums=1,
@@ -66,25 +61,36 @@ def test_forms_of_a_table(form):
 
 
 def test_long_titles_are_folded_in_the_terminal_only():
-    table = Table([[(Column('a'), 'b')]], title='word ' * 40)
+    table = Table({Column('a'): ['b']}, title='word ' * 40)
     assert max(map(len, table.text().splitlines())) <= report.WIDTH
     assert len(table.markdown().splitlines()[0]) > report.WIDTH
 
 
 def test_rows_of_several_units_of_another_length_and_none():
-    rows = [[(Column('what'), 'share'), (Column('n', '.1f', scale=100), 0.5)],
-            [(Column('what'), 'time'), (Column('n', '.3f'), 2)]]  # fmt: skip
-    assert Table(rows).text().splitlines()[2:] == ['share   50.0', 'time   2.000']
-    assert Table(rows).json() == [{'what': 'share', 'n': 0.5}, {'what': 'time', 'n': 2}]
+    what = Column('what')
+    number = Column('n', ('.1f', '.3f'), scale=(100, 1))
+    table = Table({what: ['share', 'time'], number: [0.5, 2]})
+    assert table.text().splitlines()[2:] == ['share   50.0', 'time   2.000']
+    assert table.json() == [{'what': 'share', 'n': 0.5}, {'what': 'time', 'n': 2}]
     with pytest.raises(ValueError, match='zip'):
-        Table([rows[0], rows[1][:1]]).text()
-    nothing = Table([], 'title', ['nothing'])
+        Table({what: ['share', 'time'], number: [0.5]}).text()
+    nothing = Table({what: []}, 'title', ['nothing'])
     assert (nothing.text(), nothing.json()) == ('title\n\nnothing', [])
+
+
+def test_counts_are_whole_numbers_also_where_a_column_has_gaps():
+    column = Column('lost', '_d')
+    table = Table({column: pd.Series([1200.0, math.nan])})
+    assert table.text().splitlines()[2:] == ['1 200', '    -']
+    assert table.json() == [{'lost': 1200}, {'lost': None}]
+    assert isinstance(table.json()[0]['lost'], int)
 
 
 def test_json_files_have_null_for_what_is_undefined(tmp_path):
     report.write_json({'a': [math.nan, {'b': (1.0, math.nan)}]}, tmp_path / 'a.json')
     assert json.loads((tmp_path / 'a.json').read_text()) == {'a': [None, {'b': [1.0, None]}]}
+    report.write_json([np.int64(3), np.float64(math.nan), np.bool_(True)], tmp_path / 'b.json')
+    assert json.loads((tmp_path / 'b.json').read_text()) == [3, None, True]
 
 
 def test_parameters_and_environment_are_recorded():

@@ -18,7 +18,7 @@ from gp_ground_seg.lab.scoring import report
 from gp_ground_seg.lab.scoring.benchmark import bench_cases, bench_document, run_cases
 from gp_ground_seg.lab.scoring.evaluate import TITLES, KnownScan
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
-from gp_ground_seg.lab.scoring.report import Column, Row, Table
+from gp_ground_seg.lab.scoring.report import Column, Table
 
 DESCRIPTION = """\
 Measure the time of the segmentation on your data, by stage: with theta fixed and learned in
@@ -157,13 +157,13 @@ def bench_text(document: dict[str, Any]) -> str:
     parameters = report.parameters_line(document['config_changes'])
     machine = report.machine_line(document['environment'])
     by_stage = Table(
-        [
-            [
-                (Column('stage, median [ms]'), case['name']),
-                *((Column(name, '.2f'), time) for name, time in case['stages_ms'].items()),
-            ]
-            for case in cases
-        ]
+        {
+            Column('stage, median [ms]'): [case['name'] for case in cases],
+            **{
+                Column(stage, '.2f'): [case['stages_ms'][stage] for case in cases]
+                for stage in cases[0]['stages_ms']
+            },
+        }
     )
     footer = f'{report.fold(parameters)}\n{report.fold(machine)}'
     return '\n\n'.join([_case_table(document).text(), by_stage.text(), footer])
@@ -175,25 +175,20 @@ def _case_table(document: dict[str, Any]) -> Table:
     median, largest = (Column('', '_d').show(round(n_points[key])) for key in ('median', 'max'))
     name = TITLES[document['baseline']] if peer else ''
 
-    def row(case: str, ms: dict[str, float], median: float | None, p99: float | None) -> Row:
-        cells: Row = [
-            (Column('time per frame, reading left out'), case),
-            (Column('median [ms]', '.2f'), ms['median']),
-            (Column('p99 [ms]', '.2f'), ms['p99']),
-        ]
-        if peer:
-            cells.append((Column(f'/ {name}', '.2f'), median))
-            cells.append((Column(f'p99 / {name} median', '.2f'), p99))
-        return cells
-
-    rows = [
-        row(case['name'], case['ms'], *(case['ratio'].values() if peer else (None, None)))
-        for case in cases
-    ]
+    times = [case['ms'] for case in cases] + ([peer] if peer else [])
+    names = [case['name'] for case in cases] + ([name] if peer else [])
+    columns = {
+        Column('time per frame, reading left out'): names,
+        Column('median [ms]', '.2f'): [ms['median'] for ms in times],
+        Column('p99 [ms]', '.2f'): [ms['p99'] for ms in times],
+    }
     if peer:
-        rows.append(row(name, peer, 1.0, peer['p99'] / peer['median']))
+        own = {'median': 1.0, 'p99': peer['p99'] / peer['median']}
+        ratios = [case['ratio'] for case in cases] + [own]
+        columns[Column(f'/ {name}', '.2f')] = [ratio['median'] for ratio in ratios]
+        columns[Column(f'p99 / {name} median', '.2f')] = [ratio['p99'] for ratio in ratios]
     title = (
         f'{document["n_frames"]} frames of {document["data"]}, {median} points (median), '
         f'at most {largest}'
     )
-    return Table(rows, title, n_sums=1 if peer else 0)
+    return Table(columns, title, n_sums=1 if peer else 0)

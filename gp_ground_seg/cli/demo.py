@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,7 +27,7 @@ from gp_ground_seg.data.semantic_kitti import (
 )
 from gp_ground_seg.lab.plotting.scan import plot_scan_view
 from gp_ground_seg.lab.plotting.style import new_figure
-from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Confusion, Labels, count_confusion
+from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_labels, label_ratios
 from gp_ground_seg.lab.scoring.report import Column
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
 from gp_ground_seg.ros.probe import (
@@ -164,7 +165,7 @@ class Tally:
     def __init__(self, stamps: Sequence[tuple[int, int]]) -> None:
         self._numbers = {stamp: k for k, stamp in enumerate(stamps)}
         self.n_points = self.n_faulty = 0
-        self.confusion = Confusion()
+        self.counts = Counter[str]()
         # Middle scan or nearest before it: number, places (N, 3), labels and true labels.
         self.picture: tuple[int, npt.NDArray[np.floating], Labels, Labels] | None = None
 
@@ -176,7 +177,7 @@ class Tally:
         truth = GROUNDGRID.truth(point_cloud2.read_fields(sent)['label'], xyz[:, 2])
         self.n_points += int(np.isfinite(xyz).all(axis=1).sum())
         self.n_faulty += not is_exact
-        self.confusion += count_confusion(label, truth)
+        self.counts.update(count_labels(label, truth))
         if self.picture is None or number <= len(self._numbers) // 2:
             self.picture = number, xyz, label, truth
 
@@ -185,13 +186,14 @@ def result_text(
     tally: Tally, result: dict[str, Any], n_stray: int, truth: str
 ) -> tuple[str, bool]:
     """Return the result in plain words, and whether all scans came back as they should."""
-    wanted, scores = result['asked'], tally.confusion
+    wanted, scores = result['asked'], label_ratios(tally.counts)
     is_exact = not (tally.n_faulty or n_stray)
     partition = 'each is in exactly one of the two clouds, not a byte changed'
     if not is_exact:
         partition = f'not so in {tally.n_faulty} scans; {n_stray} clouds too many'
     iou, precision, recall = (
-        f'{100.0 * value:.2f} %' for value in (scores.iou, scores.precision, scores.recall)
+        f'{100.0 * value:.2f} %'
+        for value in (scores['iou'], scores['precision'], scores['recall'])
     )
     lines = [
         f'scans    {result["n_sent"]} sent, {result["n_back"]} back, {result["n_lost"]} lost',

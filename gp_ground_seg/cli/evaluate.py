@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -17,16 +17,17 @@ from gp_ground_seg.data.inputs import Input, list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame, labelled_frames
 from gp_ground_seg.lab.scoring import report as results
 from gp_ground_seg.lab.scoring import tables
-from gp_ground_seg.lab.scoring.comparison import counts_of_all
 from gp_ground_seg.lab.scoring.evaluate import (
     PATCHWORKPP,
     KnownScan,
     Method,
-    MethodScore,
     OurMethod,
     load_kitti,
     score_methods,
+    title_of,
 )
+from gp_ground_seg.lab.scoring.frames import Scores, sums
+from gp_ground_seg.lab.scoring.metrics import label_ratios
 from gp_ground_seg.lab.scoring.objects import CUT_HEIGHT
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 
@@ -124,7 +125,7 @@ def run(arguments: argparse.Namespace) -> int:
     if changed:
         print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
     lines = [results.parameters_line(report.facts['config_changes'])]
-    lines.append(results.machine_line(environment, report.fit))
+    lines.append(results.machine_line(environment, report.backend))
     print(results.written(report.tables.values(), lines, markdown=arguments.markdown))
     if 'json' in parts:
         print(f'every number: {shown(arguments.json)}')
@@ -175,22 +176,25 @@ def _load_cloud(sequence: str, item: Input) -> KnownScan:
     return KnownScan(shown(sequence), shown(item.name), item.read().xyz, {})
 
 
-def _result_lines(scores: Sequence[MethodScore]) -> list[str]:
+def _result_lines(scores: Scores) -> list[str]:
     """Return a line for each method on all its scans, ours the last."""
-    ours, lines = scores[0], []
-    for score in reversed(scores):
-        words = [] if ours.has_labels else ['no labels of the ground']
-        if ours.has_labels:
-            found = score.confusion
-            ratios = {'IoU': found.iou, 'precision': found.precision, 'recall': found.recall}
-            words += [f'{name} {100.0 * ratio:.2f} %' for name, ratio in ratios.items()]
-        if (objects := counts_of_all(score)).n_objects:
-            words.append(f'{objects.n_lost} of {objects.n_objects} objects lost')
-        words.append(f'{1e3 * score.seconds():.1f} ms')
-        lines.append(results.fold(f'{score.title}: {", ".join(words)}'))
-    pooled = f'{options.count(len(ours.scans), "frame")} of '
-    pooled += options.count(len(ours.sequences), 'sequence')
-    return [f'{pooled}; GroundGrid convention; median time of a frame', *lines]
+    pooled, lines = sums(scores.scans), []
+    median = scores.scans.groupby('method')['seconds'].median()
+    for name in reversed(scores.methods):
+        own = pooled.loc[name]
+        words = [] if scores.conventions else ['no labels of the ground']
+        for convention in scores.conventions[:1]:
+            ratios = label_ratios(own, f'{convention}_')
+            titles = {'IoU': 'iou', 'precision': 'precision', 'recall': 'recall'}
+            words += [f'{title} {100.0 * ratios[key]:.2f} %' for title, key in titles.items()]
+        if own.get('n_objects'):
+            words.append(f'{own["n_lost"]:.0f} of {own["n_objects"]:.0f} objects lost')
+        words.append(f'{1e3 * median[name]:.1f} ms')
+        lines.append(results.fold(f'{title_of(name)}: {", ".join(words)}'))
+    n_frames = pooled['n_scans'].iloc[0]
+    counted = f'{options.count(n_frames, "frame")} of '
+    counted += options.count(len(scores.sequences), 'sequence')
+    return [f'{counted}; GroundGrid convention; median time of a frame', *lines]
 
 
 def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:

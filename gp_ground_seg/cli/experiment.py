@@ -133,7 +133,7 @@ def run(arguments: argparse.Namespace) -> int:
             given = {name: getattr(arguments, name) for name in map(_name, experiment.options)}
             report.facts.update(experiment=arguments.experiment, options=given)
             report.write(parts['json'], environment)
-    lines = [machine_line(environment, report.fit)]
+    lines = [machine_line(environment, report.backend)]
     print(written(report.tables.values(), lines, markdown=arguments.markdown))
     return 0
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.parameters.config import Config, find_spec
@@ -12,13 +11,20 @@ from gp_ground_seg.core.parameters.presets import find_preset
 from gp_ground_seg.lab.experiments.interpolation import interpolation_method
 from gp_ground_seg.lab.experiments.variants import Changes, refuse_changed, score_variants
 from gp_ground_seg.lab.scale.cluster import HERE, Runner
-from gp_ground_seg.lab.scoring.comparison import INTERVAL, interval_note, interval_text, mse_sums
-from gp_ground_seg.lab.scoring.evaluate import Method, MethodScore
+from gp_ground_seg.lab.scoring.comparison import (
+    INTERVAL,
+    RMSE,
+    Measure,
+    interval_note,
+    interval_text,
+    iou_measure,
+)
+from gp_ground_seg.lab.scoring.evaluate import Method, title_of
+from gp_ground_seg.lab.scoring.frames import Scores, sums
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import (
     Column,
     Report,
-    Row,
     Table,
     centimetres,
     changed_parameters,
@@ -26,6 +32,9 @@ from gp_ground_seg.lab.scoring.report import (
     percent,
 )
 from gp_ground_seg.lab.scoring.tables import make_report
+
+if TYPE_CHECKING:
+    from pandas import Series
 
 _FIXED: Changes = {'learning.mode': 'fixed'}
 _LEARNED: Changes = {'learning.mode': 'every_frame'}
@@ -72,23 +81,24 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     refuse_changed(config, {name for changes in MODELS.values() for name in changes}, _LATENT)
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     scores = score_variants(items, variants, [interpolation_method(config)], runner=runner)
-    last = scores[len(MODELS) - 1]
-    rows: list[Row] = [
-        [
-            (Column('method'), score.name),
-            (percent('IoU [%]', 'iou'), score.iou),
-            *_worst(score),
-            (centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
-            (INTERVAL, None if score is last else interval_text(score, last, mse_sums)),
-            (centimetres('median [cm]', 'median_absolute'), score.height.median_absolute),
-        ]
-        for score in scores
-    ]
+    *_, last = MODELS
+    pooled = sums(scores.scans)
+    columns = {
+        Column('method'): scores.methods,
+        percent('IoU [%]', 'iou'): _iou(scores).of(pooled),
+        **_worst(scores),
+        centimetres('RMSE [cm]', 'rmse'): RMSE.of(pooled),
+        INTERVAL: [
+            None if name == last else interval_text(scores, last, RMSE, ours=name)
+            for name in scores.methods
+        ],
+        centimetres('median [cm]', 'median_absolute'): _medians(scores),
+    }
     title = (
-        f'{_counted(last)}; {_rule(last)}; RMSE and median of the height under true ground, '
-        f'interval of the RMSE minus that of {last.name}; {interval_note(last)}'
+        f'{_counted(scores)}; {_rule(scores)}; RMSE and median of the height under true ground, '
+        f'interval of the RMSE minus that of {last}; {interval_note(scores)}'
     )
-    return make_report({'models': Table(rows, title)}, scores, config, changes=MODELS)
+    return make_report({'models': Table(columns, title)}, scores, config, changes=MODELS)
 
 
 def paper_steps() -> dict[str, Config]:
@@ -114,23 +124,24 @@ def compare_steps(
     peers: list[Method] = [interpolation_method(config)]
     peers += [PatchworkppMethod()] if with_peer else []
     scores = score_variants(items, steps, peers, runner=runner)
-    rows: list[Row] = []
-    for k, score in enumerate(scores):
-        other = scores[min(max(k, 1), len(steps)) - 1]
-        rows.append(
-            [
-                (Column('method'), score.title),
-                (percent('IoU [%]', 'iou'), score.iou),
-                (percent('difference', form='+.2f'), score.iou - other.iou if k else None),
-                (INTERVAL, interval_text(score, other) if k else None),
-                (centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
-            ]
-        )
+    pooled, iou = sums(scores.scans), _iou(scores)
+    shares = iou.of(pooled)
+    names = scores.methods
+    # The row above; below the steps the last of them.
+    others = [names[min(max(k, 1), len(steps)) - 1] for k in range(len(names))]
+    pairs = [*zip(names, others, strict=True)][1:]
+    columns = {
+        Column('method'): [title_of(name) for name in names],
+        percent('IoU [%]', 'iou'): shares,
+        percent('difference', form='+.2f'): [None, *(shares[a] - shares[b] for a, b in pairs)],
+        INTERVAL: [None, *(interval_text(scores, b, iou, ours=a) for a, b in pairs)],
+        centimetres('RMSE [cm]', 'rmse'): RMSE.of(pooled),
+    }
     title = (
-        f'{_counted(scores[0])}, each by itself; difference to the row above, below the steps to '
-        f'the last of them; {interval_note(scores[0])}; RMSE of the height under labelled ground'
+        f'{_counted(scores)}, each by itself; difference to the row above, below the steps to '
+        f'the last of them; {interval_note(scores)}; RMSE of the height under labelled ground'
     )
-    return make_report({'steps': Table(rows, title)}, scores, config)
+    return make_report({'steps': Table(columns, title)}, scores, config)
 
 
 def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner = HERE) -> Report:
@@ -145,49 +156,59 @@ def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner =
         for name, n in names.items()
     }
     scores = score_variants(items, variants, runner=runner)
-    most = scores[0]
-    rows: list[Row] = []
-    for score in scores:
-        fits = [scan.fit for scan in score.scans if scan.fit is not None]
-        learning = statistics.median(scan.stages['learning'] for scan in score.scans)
-        n_evaluations = statistics.median(fit.n_evaluations for fit in fits)
-        rows.append(
-            [
-                (Column('candidates', key='candidates_per_pseudo_input'), score.name),
-                (Column('n_L', '.1f', 'n_pseudo_inputs'),
-                 statistics.fmean(f.n_pseudo_inputs / f.n_segments for f in fits)),
-                (Column('evaluations', '.0f', 'n_evaluations'), n_evaluations),
-                (milliseconds('learning', 'learning'), learning),
-                (milliseconds('frame', 'seconds'), score.seconds()),
-                (percent('IoU [%]', 'iou'), score.iou),
-                (centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
-                (INTERVAL, interval_text(score, most, mse_sums) if score is not most else None),
-            ]
-        )  # fmt: skip
+    most, pooled = scores.methods[0], sums(scores.scans)
+    shares = scores.scans['n_pseudo_inputs'] / scores.scans['n_segments']
+    by_method = scores.scans.assign(n=shares).groupby('method', sort=False)
+    columns = {
+        Column('candidates', key='candidates_per_pseudo_input'): scores.methods,
+        Column('n_L', '.1f', 'n_pseudo_inputs'): by_method['n'].mean(),
+        Column('evaluations', '.0f', 'n_evaluations'): by_method['n_evaluations'].median(),
+        milliseconds('learning', 'learning'):
+            scores.times.groupby('method', sort=False)['learning'].median(),
+        milliseconds('frame', 'seconds'): by_method['seconds'].median(),
+        percent('IoU [%]', 'iou'): _iou(scores).of(pooled),
+        centimetres('RMSE [cm]', 'rmse'): RMSE.of(pooled),
+        INTERVAL: [
+            interval_text(scores, most, RMSE, ours=name) if name != most else None
+            for name in scores.methods
+        ],
+    }  # fmt: skip
     title = (
-        f'{_counted(most)}; candidates of a line for each pseudo-input; n_L: pseudo-inputs of a '
+        f'{_counted(scores)}; candidates of a line for each pseudo-input; n_L: pseudo-inputs of a '
         'segment, mean; medians of evaluations and times [ms]; RMSE of the height under labelled '
-        f'ground, interval of it minus that of the first row; {interval_note(most)}'
+        f'ground, interval of it minus that of the first row; {interval_note(scores)}'
     )
-    return make_report({'pseudo_inputs': Table(rows, title)}, scores, config)
+    return make_report({'pseudo_inputs': Table(columns, title)}, scores, config)
 
 
-def _worst(score: MethodScore) -> Row:
-    """Cells of the sequence with the lowest IoU, if there are several."""
-    iou, name = min((score.of(name).iou, name) for name in score.sequences)
-    where: Row = [
-        (percent('worst [%]', 'worst_iou'), iou),
-        (Column('in', '', 'worst_sequence'), name),
-    ]
-    return where if len(score.sequences) > 1 else []
+def _iou(scores: Scores) -> Measure:
+    """Return the IoU in the convention that counts."""
+    return iou_measure(scores.conventions[0])
 
 
-def _counted(score: MethodScore) -> str:
-    names = score.sequences
+def _medians(scores: Scores) -> Series:
+    """Median over the scans of the median absolute error of the height [m]."""
+    return scores.scans.groupby('method', sort=False)['median_absolute'].median()
+
+
+def _worst(scores: Scores) -> dict[Column, Any]:
+    """Columns of the sequence with the lowest IoU, if there are several."""
+    if len(scores.sequences) < 2:
+        return {}
+    iou = _iou(scores).of(sums(scores.scans, 'sequence')).unstack('sequence')
+    iou = iou.loc[scores.methods, sorted(scores.sequences)]
+    return {
+        percent('worst [%]', 'worst_iou'): iou.min(axis='columns'),
+        Column('in', '', 'worst_sequence'): iou.idxmin(axis='columns'),
+    }
+
+
+def _counted(scores: Scores) -> str:
+    names, n_scans = scores.sequences, sums(scores.scans)['n_scans'].iloc[0]
     where = names[0] if len(names) == 1 else f'{len(names)} sequences'
-    return f'{len(score.scans)} scans of {where}'
+    return f'{n_scans} scans of {where}'
 
 
-def _rule(score: MethodScore) -> str:
-    is_exact = 'exact' in score.scans[0].confusions
+def _rule(scores: Scores) -> str:
+    is_exact = scores.conventions == ['exact']
     return 'IoU by exact labels' if is_exact else 'IoU in the GroundGrid convention'

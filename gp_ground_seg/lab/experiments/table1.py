@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from gp_ground_seg.core.errors import ConfigError, DataError
-from gp_ground_seg.core.frame import OUTSIDE
+from gp_ground_seg.core.frame import OUTSIDE, FloatArray
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.result import FitReport, Segmentation
+from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.lab.experiments.variants import refuse_changed
 from gp_ground_seg.lab.scale.cluster import HERE, Progress, Runner
 from gp_ground_seg.lab.scoring.evaluate import OurMethod, as_it_is, load_kitti, score_methods
-from gp_ground_seg.lab.scoring.metrics import height_error
+from gp_ground_seg.lab.scoring.metrics import height_ratios, height_sums
 from gp_ground_seg.lab.scoring.report import Column, Report, Table, changed_parameters
 
 MODELS = {'Z-L': 'latent', 'Z': 'line_gradient'}
@@ -48,7 +48,7 @@ def table1(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Rep
     for sequence, index in CHOICES:
         if (sequence, index) not in frames:
             raise DataError(f'no frame {index} in sequence {sequence}')
-    ((rows, fit),) = runner.run(partial(_measure, config, frames), [*CHOICES])
+    ((rows, backend),) = runner.run(partial(_measure, config, frames), [*CHOICES])
     names = ['n_PG', 'n_L', *VARIANCES]
     others = [n for n in rows[0] if n not in ('segment', *names) and not n.startswith('inliers')]
     variances = 'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar without unit]'
@@ -61,7 +61,7 @@ def table1(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Rep
         'errors': _table(rows, others, errors),
     }
     facts = {'config_changes': changed_parameters(config), 'config': config.nested()}
-    return Report(tables, rows, fit, facts)
+    return Report(tables, rows, backend, facts)
 
 
 def _measure(
@@ -69,8 +69,8 @@ def _measure(
     frames: Mapping[tuple[str, str], Frame],
     choices: Sequence[tuple[str, str]],
     progress: Progress,
-) -> tuple[list[dict[str, Any]], FitReport]:
-    """Rows of the segments chosen, and a fit of the latent model."""
+) -> tuple[list[dict[str, Any]], str]:
+    """Rows of the segments chosen, and the backend."""
     rows: list[dict[str, Any]] = []
     methods = []
     for name, model in MODELS.items():
@@ -78,15 +78,16 @@ def _measure(
         methods.append(OurMethod(variant, name))
     for choice in progress(choices):
         rows += _rows(frames[choice], CHOICES[choice], methods)
-    return rows, methods[0].last.fit
+    return rows, methods[0].last.fit.backend
 
 
 def _table(rows: Sequence[dict[str, Any]], names: Sequence[str], title: str) -> Table:
-    columns = [Column('segment')]
+    columns = {Column('segment'): [row['segment'] for row in rows]}
     for name in names:
         number = '.4f' if name.startswith('t ') else '#.4g'
-        columns.append(Column(name, 'd' if isinstance(rows[0][name], int) else number))
-    return Table([[(column, row[column.title]) for column in columns] for row in rows], title)
+        column = Column(name, 'd' if isinstance(rows[0][name], int) else number)
+        columns[column] = [row[name] for row in rows]
+    return Table(columns, title)
 
 
 def _rows(
@@ -96,6 +97,7 @@ def _rows(
     scan = load_kitti(frame)
     z = scan.points[:, 2].astype(np.float64)
     scores = score_methods([scan] * N_REPEATS, methods, as_it_is, each_alone=True)
+    seconds = scores.scans.groupby('method', sort=False)['seconds'].median()
     results = {method.name: method.last for method in methods}
     # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
     common = results['Z-L']
@@ -121,12 +123,12 @@ def _rows(
                 'held out': int(held_out.sum()),
                 **{
                     # Of the process itself, as in the paper; not the corrected surface.
-                    f'held out {name}': height_error(
+                    f'held out {name}': _smse(
                         z[held_out], z[held_out] - result.labelled.height[held_out]
-                    ).smse
+                    )
                     for name, result in results.items()
                 },
-                **{f't {score.name} [s]': score.seconds() for score in scores},
+                **{f't {name} [s]': own for name, own in seconds.items()},
             }
         )
     return rows
@@ -137,4 +139,9 @@ def _in_sample(result: Segmentation, segment: int) -> tuple[int, float]:
     candidates, surface = result.candidates, result.surface
     inlier = surface.inlier & (candidates.segment == segment)
     estimate = np.interp(candidates.r[inlier], surface.knots, surface.mean[segment])
-    return int(inlier.sum()), height_error(candidates.z[inlier], estimate).smse
+    return int(inlier.sum()), _smse(candidates.z[inlier], estimate)
+
+
+def _smse(truth: FloatArray, estimate: FloatArray) -> float:
+    """Standardised mean squared error of heights, (n,) [m]."""
+    return float(height_ratios(height_sums(truth, estimate))['smse'])

@@ -19,12 +19,11 @@ from gp_ground_seg.lab.scoring.evaluate import (
     OURS,
     KnownScan,
     Method,
-    MethodScore,
     OurMethod,
     load_kitti,
-    pool,
     score_methods,
 )
+from gp_ground_seg.lab.scoring.frames import Scores, make_scores
 from gp_ground_seg.lab.scoring.objects import CLASSES, LOW_CLASSES, LOW_HEIGHTS, Objects
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 from gp_ground_seg.lab.simulation import PLACES, SCENES, SENSORS, Kind, Scene, simulate_scan
@@ -123,7 +122,7 @@ def score_variants(
     peers: Sequence[Method] = (),
     *,
     runner: Runner = HERE,
-) -> list[MethodScore]:
+) -> Scores:
     """Run variants, then `peers`, once on every scan, alternately, each scan without a past."""
     ours = [OurMethod(config, name) for name, config in variants.items()]
     return score_methods(items, [*ours, *peers], load_scan, each_alone=True, runner=runner)
@@ -136,7 +135,7 @@ def score_simulated(
     *,
     with_peer: bool,
     told_in: Collection[str] = (),
-) -> tuple[list[MethodScore], list[str]]:
+) -> tuple[Scores, list[str]]:
     """Segment simulated scans, all sensors with the parameters `config`.
 
     `with_peer` runs Patchwork++ on the same clouds, as `peer_of` makes it; in the scenes `told_in`
@@ -147,11 +146,10 @@ def score_simulated(
     parts = runner.run(partial(_score_groups, config, with_peer, told_in), groups)
     outcomes = list(itertools.chain(*parts))
     refused = [found for found in outcomes if isinstance(found, str)]
-    scored = [score for found in outcomes if not isinstance(found, str) for score in found]
+    scored = [found for found in outcomes if not isinstance(found, str)]
     if not scored:
         raise PointCloudError('; '.join(refused))
-    names = dict.fromkeys(score.name for score in scored)
-    return [pool(name, [s for s in scored if s.name == name]) for name in names], refused
+    return make_scores(score.rows for score in scored), refused
 
 
 def _score_groups(
@@ -160,9 +158,9 @@ def _score_groups(
     told_in: Collection[str],
     groups: Sequence[Sequence[SimulatedFrame]],
     progress: Progress,
-) -> list[list[MethodScore] | str]:
+) -> list[Scores | str]:
     """Scores of each group of scans, of one sensor in one scene, or why one is refused."""
-    outcomes: list[list[MethodScore] | str] = []
+    outcomes: list[Scores | str] = []
     for frames in progress(groups):
         sensor, scene, *_ = frames[0]
         ours = {OURS: config} | ({TOLD: told(config, sensor)} if scene in told_in else {})

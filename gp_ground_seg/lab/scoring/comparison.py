@@ -8,22 +8,22 @@ rather too narrow than too wide.
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.special
 
 from gp_ground_seg.core.frame import FloatArray
-from gp_ground_seg.lab.scoring import report
-from gp_ground_seg.lab.scoring.evaluate import MethodScore, ScanScore
-from gp_ground_seg.lab.scoring.metrics import ratio
-from gp_ground_seg.lab.scoring.objects import SHARES, ObjectCount, Share
-from gp_ground_seg.lab.scoring.report import Column, Table, percent
+from gp_ground_seg.lab.scoring.evaluate import title_of
+from gp_ground_seg.lab.scoring.frames import KEYS, Scores, require_pandas, sums
+from gp_ground_seg.lab.scoring.metrics import label_ratios, ratio
+from gp_ground_seg.lab.scoring.objects import SHARES
+from gp_ground_seg.lab.scoring.report import Column, Table, centimetres, milliseconds, percent
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 CONFIDENCE, N_DRAWS, SEED = 0.95, 10_000, 0
 N_BLOCKS, MIN_BLOCK = 10, 5
@@ -35,8 +35,19 @@ N_NAMED = 3
 INTERVAL = Column('95 % interval', key='interval')
 """Column of `interval_text`."""
 
-Measure = Callable[[MethodScore], tuple[float, float]]
-"""A ratio, such as an IoU, as numerator and denominator; each is a sum over scans."""
+
+class Measure(NamedTuple):
+    """A ratio of sums, each of some columns of a frame, or the root of it."""
+
+    above: tuple[str, ...]
+    below: tuple[str, ...]
+    is_root: bool = False
+
+    def of(self, found: DataFrame) -> Any:
+        """Return the ratio of each row."""
+        above, below = (found[[*names]].sum(axis='columns') for names in self[:2])
+        value = ratio(above, below)
+        return np.sqrt(value) if self.is_root else value
 
 
 class Interval(NamedTuple):
@@ -56,167 +67,175 @@ class Interval(NamedTuple):
         return f'{signed.show(self.low)} to {signed.show(self.high)}' + ' tie' * self.is_tie
 
 
-def clusters(score: MethodScore) -> list[MethodScore]:
-    """Return the scans that are drawn together; of one cluster, blocks of successive frames."""
-    names = list(dict.fromkeys(scan.cluster or scan.sequence for scan in score.scans))
-    if len(names) > 1:
-        parts: dict[str, list[ScanScore]] = {name: [] for name in names}
-        for scan in score.scans:
-            parts[scan.cluster or scan.sequence].append(scan)
-        return [MethodScore(score.name, tuple(scans)) for scans in parts.values()]
-    n = len(score.scans)
+def iou_measure(convention: str = '') -> Measure:
+    """Return the IoU in a convention; without one, in columns that are of one only."""
+    tp, fp, fn = (f'{convention}_{name}'.lstrip('_') for name in ('tp', 'fp', 'fn'))
+    return Measure((tp,), (tp, fp, fn))
+
+
+RMSE = Measure(('square',), ('n_points',), is_root=True)
+
+
+def clusters(scores: Scores) -> DataFrame:
+    """Return sequence, index and cluster of each scan; of one cluster, blocks of scans."""
+    scans = scores.scans
+    found = scans.loc[scans['method'] == scores.methods[0], [*KEYS[1:], 'cluster']]
+    if found['cluster'].nunique() > 1:
+        return found
+    n = len(found)
     n_blocks = max(min(N_BLOCKS, n // MIN_BLOCK), 1)
-    edges = [n * k // n_blocks for k in range(n_blocks + 1)]
-    return [MethodScore(score.name, score.scans[a:b]) for a, b in itertools.pairwise(edges)]
-
-
-def iou_sums(score: MethodScore) -> tuple[float, float]:
-    """Return the IoU in the convention that counts, as a ratio."""
-    return score.confusion.iou_sums
-
-
-def mse_sums(score: MethodScore) -> tuple[float, float]:
-    """Return the mean squared error of the height, as a ratio."""
-    return score.height.sum_squared_error, score.height.n_points
+    ends = [n * k // n_blocks for k in range(1, n_blocks)]
+    return found.assign(cluster=np.searchsorted(ends, np.arange(n), side='right'))
 
 
 def difference_interval(
-    ours: MethodScore,
-    other: MethodScore,
-    sums: Measure = iou_sums,
+    scores: Scores,
+    other: str,
+    measure: Measure,
+    frame: DataFrame | None = None,
     rng: np.random.Generator | None = None,
+    ours: str = '',
 ) -> Interval | None:
-    """Interval of the pooled ratio of one method minus that of another on the same scans.
+    """Interval of a measure of ours, by default the first method, minus that of another.
 
-    None with fewer than two clusters, or where a ratio is over nothing. For `mse_sums` it is the
-    difference of the roots, the RMSE. `rng` draws; by default in the same way each time.
+    It is of the pooled scans, or of the rows of another `frame` of the scores. None with fewer
+    than two clusters, or where a ratio is over nothing. `rng` draws; by default in the same way
+    each time.
     """
-    parts = clusters(ours), clusters(other)
-    n = len(parts[0])
+    of_scan = clusters(scores)
+    names = of_scan['cluster'].unique()
+    n = len(names)
     if n < 2:
         return None
     rng = np.random.default_rng(SEED) if rng is None else rng
     times_drawn = rng.multinomial(n, np.full(n, 1.0 / n), size=N_DRAWS)
+    needed = [*dict.fromkeys([*measure.above, *measure.below])]
+    rows = (scores.scans if frame is None else frame)[[*KEYS, *needed]]
+    parts = sums(rows.merge(of_scan, on=[*KEYS[1:]]), 'cluster')
 
-    def ratios(scores: list[MethodScore]) -> FloatArray:
-        above, below = (times_drawn @ np.array([sums(s) for s in scores], dtype=np.float64)).T
-        result: FloatArray = np.divide(above, below, where=below > 0, out=np.full(N_DRAWS, np.nan))
-        return np.sqrt(result) if sums is mse_sums else result
+    def drawn(method: str) -> FloatArray:
+        part = parts.loc[method].reindex(names, fill_value=0)[needed].to_numpy(dtype=np.float64)
+        pooled = require_pandas().DataFrame(times_drawn @ part, columns=needed)
+        return np.asarray(measure.of(pooled))
 
-    difference = ratios(parts[0]) - ratios(parts[1])
+    difference = drawn(ours or scores.methods[0]) - drawn(other)
     if np.isnan(difference).any():
         return None
     tail = 0.5 * (1.0 - CONFIDENCE)
     return Interval(*np.quantile(difference, [tail, 1.0 - tail]).tolist())
 
 
-def interval_text(ours: MethodScore, other: MethodScore, sums: Measure = iou_sums) -> str | None:
+def interval_text(
+    scores: Scores,
+    other: str,
+    measure: Measure,
+    frame: DataFrame | None = None,
+    ours: str = '',
+) -> str | None:
     """`difference_interval` in percent or cm; None without one."""
-    found = difference_interval(ours, other, sums)
+    found = difference_interval(scores, other, measure, frame, ours=ours)
     return None if found is None else found.text(percent(''))
 
 
-def interval_note(score: MethodScore) -> str:
-    """Say what the intervals of differences to this method are, for the title of a table."""
-    parts = clusters(score)
-    if len(parts) < 2:
+def interval_note(scores: Scores) -> str:
+    """Say what the intervals of differences are, for the title of a table."""
+    n = clusters(scores)['cluster'].nunique()
+    if n < 2:
         return 'no intervals: they need two sequences, or ten frames of one'
-    kind = 'sequences' if len(parts) == len(score.sequences) else 'scenes'
-    if len({scan.cluster or scan.sequence for scan in score.scans}) == 1:
+    kind = 'sequences' if n == len(scores.sequences) else 'scenes'
+    if scores.scans['cluster'].nunique() == 1:
         kind = 'blocks of successive frames'
-    return f'95 % interval: bootstrap over {len(parts)} {kind}; tie: it holds 0'
+    return f'95 % interval: bootstrap over {n} {kind}; tie: it holds 0'
 
 
-def without_one_table(ours: MethodScore, other: MethodScore) -> Table:
+def without_one_table(scores: Scores, other: str) -> Table:
     """Compare the IoU of two methods with each of three or more sequences left out.
 
     The interval is a jackknife-t: wider than the bootstrap's, and the more honest with six
     sequences (Efron and Tibshirani, 1993, chapter 11).
     """
-    names, differences = ours.sequences, []
-    rows: list[report.Row] = []
-    for left_out in [*names, NONE]:
-        kept = [name for name in names if name != left_out]
-        iou, peer = (score.of(*kept).iou for score in (ours, other))
-        differences.append(iou - peer)
-        cells = (percent('IoU', 'iou'), iou), (percent(f'{other.title} IoU', 'peer_iou'), peer)
-        difference = percent('difference', form='+.2f')
-        rows.append([(Column('left out'), left_out), *cells, (difference, iou - peer)])
-    *without, whole = differences
-    n = len(names)
-    reach = math.sqrt((n - 1) ** 2 / n * np.var(without, ddof=1))
+    names = scores.sequences
+    parts = sums(scores.scans, 'sequence')
+    ours, peer = (
+        label_ratios(own.sum() - own.reindex([*names, NONE], fill_value=0),
+                     f'{scores.conventions[0]}_')['iou']
+        for own in (parts.loc[method] for method in (scores.methods[0], other))
+    )  # fmt: skip
+    difference = ours - peer
+    n, whole = len(names), float(difference[NONE])
+    reach = math.sqrt((n - 1) ** 2 / n * difference[names].var())
     reach *= float(scipy.special.stdtrit(n - 1, 0.5 + 0.5 * CONFIDENCE))
     interval = Interval(whole - reach, whole + reach).text(percent(''))
+    columns = {
+        Column('left out'): difference.index,
+        percent('IoU', 'iou'): ours,
+        percent(f'{title_of(other)} IoU', 'peer_iou'): peer,
+        percent('difference', form='+.2f'): difference,
+    }
     title = (
         f'IoU without one sequence  [%]; 95 % interval of the difference by jackknife: {interval}'
     )
-    return Table(rows, title, n_sums=1)
+    return Table(columns, title, n_sums=1)
 
 
-def counts_of_all(score: MethodScore) -> ObjectCount:
-    """Sum up the objects of all classes in all bands."""
-    return sum(itertools.chain(*score.objects.values()), ObjectCount())
+def measures(convention: str) -> dict[Column, Measure]:
+    """Return what is compared by `difference_table`, in the convention that counts."""
+    tp, fp, fn = (f'{convention}_{name}' for name in ('tp', 'fp', 'fn'))
+    return {
+        percent('IoU [%]'): iou_measure(convention),
+        percent('precision [%]'): Measure((tp,), (tp, fp)),
+        percent('recall [%]'): Measure((tp,), (tp, fn)),
+        percent('returns on objects called ground [%]'): Measure(('n_ground',), ('n_returns',)),
+        percent('objects lost [%]'): Measure(('n_lost',), ('n_objects',)),
+        **{
+            percent(f'{title} [%]'): Measure((f'{name}_wrong',), (f'{name}_n',))
+            for name, title in SHARES.items()
+        },
+        centimetres('RMSE of the height [cm]'): RMSE,
+        percent('heights within 1 std, ideally 68.3 [%]'):
+            Measure(('n_within_1',), ('n_with_std',)),
+        percent('heights within 2 std, ideally 95.4 [%]'):
+            Measure(('n_within_2',), ('n_with_std',)),
+        milliseconds('time per frame, mean [ms]'): Measure(('seconds',), ('n_scans',)),
+    }  # fmt: skip
 
 
-def share_sums(name: str, score: MethodScore) -> tuple[float, float]:
-    """Return one of `SHARES` as a ratio."""
-    found = score.shares.get(name, Share())
-    return found.n_wrong, found.n
-
-
-MEASURES: tuple[tuple[Column, Measure], ...] = (
-    (percent('IoU [%]'), iou_sums),
-    (percent('precision [%]'),
-     lambda s: (s.confusion.tp, s.confusion.tp + s.confusion.fp)),
-    (percent('recall [%]'), lambda s: (s.confusion.tp, s.confusion.tp + s.confusion.fn)),
-    (percent('returns on objects called ground [%]'),
-     lambda s: (counts_of_all(s).n_ground, counts_of_all(s).n_returns)),
-    (percent('objects lost [%]'),
-     lambda s: (counts_of_all(s).n_lost, counts_of_all(s).n_objects)),
-    *((percent(f'{title} [%]'), partial(share_sums, name)) for name, title in SHARES.items()),
-    (report.centimetres('RMSE of the height [cm]'), mse_sums),
-    (percent('heights within 1 std, ideally 68.3 [%]'),
-     lambda s: (s.height.n_within_1, s.height.n_with_std)),
-    (percent('heights within 2 std, ideally 95.4 [%]'),
-     lambda s: (s.height.n_within_2, s.height.n_with_std)),
-    (report.milliseconds('time per frame, mean [ms]'),
-     lambda s: (sum(scan.seconds for scan in s.scans), len(s.scans))),
-)  # fmt: skip
-"""Measures that are compared: their columns, and each as a ratio of sums over scans."""
-
-
-def difference_table(ours: MethodScore, other: MethodScore) -> Table:
-    """Compare two methods by each of `MEASURES`; those without data in the scans are left out."""
-    rows: list[report.Row] = []
-    for column, sums in MEASURES:
-        value, peer = (ratio(*sums(score)) for score in (ours, other))
-        if math.isnan(value) and math.isnan(peer):
+def difference_table(scores: Scores, other: str) -> Table:
+    """Compare two methods by each of `measures`; those without data in the scans are left out."""
+    pooled = sums(scores.scans)
+    rows = []
+    for unit, measure in measures(*scores.conventions[:1] or ['']).items():
+        if not {*measure.above, *measure.below} <= {*pooled}:
             continue
-        if sums is mse_sums:
-            value, peer = math.sqrt(value), math.sqrt(peer)
-        interval = difference_interval(ours, other, sums)
-        signed = replace(column, title='difference', key='', format=f'+{column.format}')
-        rows.append(
-            [
-                (Column('measure'), column.title),
-                (replace(column, title='given', key=''), value),
-                (replace(column, title=other.title, key='peer'), peer),
-                (signed, value - peer),
-                (INTERVAL, None if interval is None else interval.text(column)),
-            ]
-        )
-    title = f'Given minus {other.title}; {interval_note(ours)}'
-    return Table(rows, title, [_changed_note(other)])
-
-
-def _changed_note(other: MethodScore) -> str:
-    """Say how many points have another label than by the first method, and where most."""
-    n_changed = sum(scan.n_changed for scan in other.scans)
-    n_points = sum(scan.n_points for scan in other.scans)
-    shares = {
-        f'{scan.sequence}/{scan.index}': ratio(scan.n_changed, scan.n_points)
-        for scan in other.scans
+        value, peer = measure.of(pooled)[[scores.methods[0], other]]
+        if not (math.isnan(value) and math.isnan(peer)):
+            interval = difference_interval(scores, other, measure)
+            text = None if interval is None else interval.text(unit)
+            rows.append((unit, value, peer, value - peer, text))
+    units, *columns = zip(*rows, strict=True)
+    formats, scales = (
+        tuple(str(unit.format) for unit in units),
+        tuple(unit.scale for unit in units),
+    )
+    titles = [
+        Column('given', formats, scale=scales),
+        Column(title_of(other), formats, 'peer', scales),
+        Column('difference', tuple(f'+{form}' for form in formats), scale=scales),
+        INTERVAL,
+    ]
+    found = {
+        Column('measure'): [u.title for u in units],
+        **dict(zip(titles, columns, strict=True)),
     }
-    most = sorted(shares, key=lambda name: -shares[name])[:N_NAMED]
-    named = ', '.join(f'{name} ({shares[name]:.2%})' for name in most)
-    return f'points with two labels: {ratio(n_changed, n_points):.2%}; most in {named}'
+    title = f'Given minus {title_of(other)}; {interval_note(scores)}'
+    return Table(found, title, [_changed_note(scores.of([other]).scans)])
+
+
+def _changed_note(scans: DataFrame) -> str:
+    """Say how many points have another label than by the first method, and where most."""
+    share = ratio(scans['n_changed'], scans['points'])
+    most = share.sort_values(ascending=False, kind='stable').head(N_NAMED)
+    where = scans['sequence'] + '/' + scans['index']
+    named = ', '.join(f'{where[k]} ({value:.2%})' for k, value in most.items())
+    whole = ratio(scans['n_changed'].sum(), scans['points'].sum())
+    return f'points with two labels: {whole:.2%}; most in {named}'

@@ -1,11 +1,8 @@
-"""Methods over scans whose truth is known: scores by scan, and their sums."""
+"""Methods over scans whose truth is known, and the rows of their scores."""
 
 from __future__ import annotations
 
 import copy
-import itertools
-import math
-import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,34 +23,27 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import Frame, read_entries, read_points
 from gp_ground_seg.lab.scale.cluster import HERE, Progress, Runner
 from gp_ground_seg.lab.scoring import metrics
-from gp_ground_seg.lab.scoring.metrics import (
-    CONVENTIONS,
-    GROUNDGRID,
-    Calibration,
-    Confusion,
-    HeightError,
-    Labels,
-    Sums,
-)
+from gp_ground_seg.lab.scoring.frames import Rows, Scores, make_scores, require_pandas
+from gp_ground_seg.lab.scoring.metrics import CONVENTIONS, GROUNDGRID, Labels
 from gp_ground_seg.lab.scoring.objects import (
-    LOW_THINGS,
+    OBJECT_COUNTS,
     CutScan,
-    ObjectCounts,
     Objects,
-    Shares,
     count_false_cells,
     count_objects,
     cut_objects,
     labelled_objects,
-    pool_objects,
-    pool_shares,
 )
 
 OURS = 'gp_ground_seg'
 PATCHWORKPP = 'patchworkpp'
 TITLES = {PATCHWORKPP: 'Patchwork++'}
 """Names of methods in tables, where they differ from those in files."""
-ALL = 'all'
+STATE = (
+    'status', 'n_evaluations', 'n_segments',
+    'sensor_height', 'sensor_height_estimated', 'sensor_roll', 'sensor_pitch',
+)  # fmt: skip
+"""What is reported of a scan of our method; angles in radians."""
 Points = npt.NDArray[np.floating]
 
 
@@ -143,132 +133,9 @@ class KnownScan:
     cut: CutScan | None = None  # what of it is segmented once more, to count low things
 
 
-@dataclass(frozen=True)
-class RingScore(Sums):
-    """Scores within one ring of horizontal range."""
-
-    confusion: Confusion = field(default_factory=Confusion)
-    height: HeightError = field(default_factory=HeightError)
-    calibration: Calibration = field(default_factory=Calibration)
-
-
-@dataclass(frozen=True)
-class ScanScore:
-    """How one method did on one scan."""
-
-    sequence: str
-    index: str
-    seconds: float  # without reading
-    stages: dict[str, float] = field(default_factory=dict)  # seconds, if the method reports them
-    confusions: dict[str, Confusion] = field(default_factory=dict)  # as `KnownScan.truths`
-    height: HeightError = field(default_factory=HeightError)
-    rings: tuple[RingScore, ...] = ()  # by `metrics.RING_TITLES`, where the truth is known
-    objects: ObjectCounts = field(default_factory=dict)
-    shares: Shares = field(default_factory=dict)
-    pose: SensorPose | None = None  # of our method
-    fit: FitReport | None = None
-    cluster: str = ''  # as in `KnownScan`
-    n_points: int = 0
-    n_changed: int = 0  # of them with another label than by the first method
-
-    @property
-    def confusion(self) -> Confusion:
-        """Counts in the convention that counts."""
-        return next(iter(self.confusions.values()), Confusion())
-
-    @property
-    def calibration(self) -> Calibration:
-        """Sum over the rings; empty if the method has no probabilities."""
-        return sum((ring.calibration for ring in self.rings), Calibration())
-
-
-@dataclass(frozen=True)
-class MethodScore:
-    """How one method, or one variant of ours, did on all scans, in their order.
-
-    The properties are sums over the scans.
-    """
-
-    name: str
-    scans: tuple[ScanScore, ...]
-
-    @property
-    def title(self) -> str:
-        """Name in tables."""
-        return TITLES.get(self.name, self.name)
-
-    @property
-    def has_labels(self) -> bool:
-        """Whether the ground of the scans is known."""
-        return any(scan.confusions for scan in self.scans)
-
-    @property
-    def sequences(self) -> list[str]:
-        """Names of the sequences, in order."""
-        return list(dict.fromkeys(scan.sequence for scan in self.scans))
-
-    def of(self, *sequences: str) -> MethodScore:
-        """Return the part of some sequences."""
-        return MethodScore(self.name, tuple(s for s in self.scans if s.sequence in sequences))
-
-    def by_sequence(self) -> list[tuple[str, MethodScore]]:
-        """Return the parts of the sequences by name, and the whole as `ALL`."""
-        return [*((name, self.of(name)) for name in self.sequences), (ALL, self)]
-
-    def pooled(self, convention: str) -> Confusion:
-        """Sum of the counts in a convention."""
-        return sum((scan.confusions[convention] for scan in self.scans), Confusion())
-
-    @property
-    def confusion(self) -> Confusion:
-        """Counts in the convention that counts."""
-        return sum((scan.confusion for scan in self.scans), Confusion())
-
-    @property
-    def iou(self) -> float:
-        """Intersection over union of `confusion`."""
-        return self.confusion.iou
-
-    @property
-    def rings(self) -> tuple[RingScore, ...]:
-        """Scores by ring."""
-        of_scans = [scan.rings for scan in self.scans]
-        return tuple(sum(ring, RingScore()) for ring in zip(*of_scans, strict=True))
-
-    @property
-    def objects(self) -> ObjectCounts:
-        """Counts of objects."""
-        return pool_objects([scan.objects for scan in self.scans])
-
-    @property
-    def shares(self) -> Shares:
-        """Low things called ground, and false cells."""
-        return pool_shares([scan.shares for scan in self.scans])
-
-    @property
-    def calibration(self) -> Calibration:
-        """Probabilities against the truth."""
-        return sum((scan.calibration for scan in self.scans), Calibration())
-
-    @property
-    def height(self) -> HeightError:
-        """Height errors."""
-        return sum((scan.height for scan in self.scans), HeightError())
-
-    def seconds(self, average: Callable[[list[float]], float] = statistics.median) -> float:
-        """Average time per scan; NaN without scans."""
-        return average([scan.seconds for scan in self.scans]) if self.scans else math.nan
-
-    @property
-    def median_stages(self) -> dict[str, float]:
-        """Median seconds of each stage."""
-        names = self.scans[0].stages
-        return {name: statistics.median(s.stages[name] for s in self.scans) for name in names}
-
-
-def pool(name: str, scores: Sequence[MethodScore]) -> MethodScore:
-    """Put the scans of several scores together."""
-    return MethodScore(name, tuple(scan for score in scores for scan in score.scans))
+def title_of(method: str) -> str:
+    """Name of a method in tables."""
+    return TITLES.get(method, method)
 
 
 def load_kitti(frame: Frame, cut: float = 0.0) -> KnownScan:
@@ -303,8 +170,8 @@ def score_methods(
     each_alone: bool = False,
     clock: Callable[[], float] = time.perf_counter,
     runner: Runner = HERE,
-) -> list[MethodScore]:
-    """Run methods alternately on the same scans and score each run, in the order of `methods`.
+) -> Scores:
+    """Run methods alternately on the same scans and score each run.
 
     Which method goes first changes from scan to scan. Each runs once without counting:
     compilation and first allocations are not its speed. `items`, grouped by sequence, are loaded
@@ -313,11 +180,10 @@ def score_methods(
     Of scans with a `KnownScan.cut`, which all have or none, copies of the methods run on it, in
     the same order, without being timed.
     """
+    require_pandas()
     score = partial(_score_block, load, methods, each_alone, clock)
     has_past = not each_alone and any(method.depends_on_past for method in methods)
-    parts = runner.run(score, items, attrgetter('sequence') if has_past else None)
-    scans = [tuple(itertools.chain(*blocks)) for blocks in zip(*parts, strict=True)]
-    return [MethodScore(m.name, found) for m, found in zip(methods, scans, strict=True)]
+    return make_scores(runner.run(score, items, attrgetter('sequence') if has_past else None))
 
 
 def _score_block(
@@ -327,9 +193,9 @@ def _score_block(
     clock: Callable[[], float],
     items: Sequence[Any],
     progress: Progress,
-) -> list[list[ScanScore]]:
-    """Scores of some scans, by method."""
-    scores: list[list[ScanScore]] = [[] for _ in methods]
+) -> Rows:
+    """Rows of some scans, by frame."""
+    rows: Rows = {}
     sequence = None
     for k, item in enumerate(progress(items)):
         scan = load(item)
@@ -350,10 +216,17 @@ def _score_block(
             _run(method, scan)
             seconds[method] = clock() - start
         results = [method.result() for method in methods]
-        for method, other, result, found in zip(methods, copies, results, scores, strict=True):
-            shares = _low_things(scan, other, forgets=forgets)
-            found.append(_score(scan, result, seconds[method], results[0].label, shares))
-    return scores
+        for method, other, result in zip(methods, copies, results, strict=True):
+            own = _score(scan, result)
+            own['scans'][0] |= {
+                'seconds': seconds[method],
+                'n_changed': int((result.label != results[0].label).sum()),
+                **_low_things(scan, other, forgets=forgets),
+            }
+            keys = {'method': method.name, 'sequence': scan.sequence, 'index': scan.index}
+            for name, found in own.items():
+                rows.setdefault(name, []).extend(keys | row for row in found)
+    return rows
 
 
 def _run(method: Method, scan: KnownScan) -> None:
@@ -363,69 +236,50 @@ def _run(method: Method, scan: KnownScan) -> None:
         raise PointCloudError(f'{scan.sequence}/{scan.index}: {method.name}: {error}') from error
 
 
-def _low_things(scan: KnownScan, method: Method | None, *, forgets: bool) -> Shares:
+def _low_things(scan: KnownScan, method: Method | None, *, forgets: bool) -> dict[str, int]:
     """Run a method on what is left of a cut scan, and count the low things called ground."""
     if scan.cut is None or method is None:
         return {}
     if forgets:
         method.reset()
     _run(method, replace(scan, points=scan.points[scan.cut.is_kept]))
-    return {LOW_THINGS: scan.cut.count(method.result().label)}
+    return scan.cut.count(method.result().label)
 
 
-def _score(
-    scan: KnownScan, result: MethodResult, seconds: float, first: Labels, shares: Shares
-) -> ScanScore:
-    label, max_nlpd = result.label, _max_nlpd(scan, result)
-    if scan.semantic is not None and result.height is not None:
-        shares = shares | count_false_cells(scan.points, label, result.height, scan.semantic)
-    return ScanScore(
-        scan.sequence, scan.index, seconds, result.stages,
-        {key: metrics.count_confusion(label, truth) for key, truth in scan.truths.items()},
-        _height_error(scan, result, slice(None), max_nlpd),
-        _score_rings(scan, result, max_nlpd),
-        {} if scan.objects is None else count_objects(scan.points, label, scan.objects),
-        shares, result.pose, result.fit, scan.cluster or scan.sequence,
-        len(label), int((label != first).sum()),
-    )  # fmt: skip
-
-
-def _height_error(
-    scan: KnownScan, result: MethodResult, inside: BoolArray | slice, max_nlpd: float
-) -> HeightError:
-    """Error of the surface under the ground points `inside` a part of the scan."""
-    if scan.ground_z is None or scan.is_ground is None:
-        return HeightError()
-    ground = scan.is_ground[inside]
-    std = getattr(result, scan.std)
-    return metrics.height_error(
-        scan.ground_z[inside][ground],
-        result.ground_z[inside][ground],
-        None if std is None else std[inside][ground],
-        max_nlpd,
-    )
-
-
-def _max_nlpd(scan: KnownScan, result: MethodResult) -> float:
-    """Largest NLPD that counts in a scan."""
-    std = getattr(result, scan.std)
-    if scan.ground_z is None or scan.is_ground is None or std is None:
-        return math.inf
-    error = (result.ground_z - scan.ground_z)[scan.is_ground]
-    return metrics.largest_nlpd(metrics.negative_log_density(error, std[scan.is_ground]))
-
-
-def _score_rings(scan: KnownScan, result: MethodResult, max_nlpd: float) -> tuple[RingScore, ...]:
-    truth = next(iter(scan.truths.values()), None)
-    if truth is None:
-        return ()
-    confusions = metrics.count_rings(result.label, truth, scan.points)
-    ring = metrics.ring_of(scan.points)
-    found = []
-    for k, confusion in enumerate(confusions):
-        inside, calibration = ring == k, Calibration()
+def _score(scan: KnownScan, result: MethodResult) -> Rows:
+    """Rows of a scan, by frame."""
+    label, rows = result.label, Rows()
+    sums: dict[str, Any] = {'cluster': scan.cluster or scan.sequence, 'n_scans': 1}
+    sums['points'] = len(label)
+    for key, truth in scan.truths.items():
+        counts = metrics.count_labels(label, truth)
+        sums |= {f'{key}_{name}': n for name, n in counts.items()}
+    for truth in [*scan.truths.values()][:1]:
+        rows['rings'] = metrics.count_rings(label, truth, scan.points)
         if result.p_ground is not None:
-            calibration = metrics.count_calibration(result.p_ground[inside], truth[inside])
-        height = _height_error(scan, result, inside, max_nlpd)
-        found.append(RingScore(confusion, height, calibration))
-    return tuple(found)
+            rows['bins'] = metrics.count_bins(result.p_ground, truth)
+    if scan.ground_z is not None and scan.is_ground is not None:
+        ground, std = scan.is_ground, getattr(result, scan.std)
+        sums |= metrics.height_sums(
+            scan.ground_z[ground], result.ground_z[ground], None if std is None else std[ground]
+        )
+    if scan.objects is not None:
+        rows['objects'] = count_objects(scan.points, label, scan.objects)
+        sums |= {name: sum(row[name] for row in rows['objects']) for name in OBJECT_COUNTS}
+    if scan.semantic is not None and result.height is not None:
+        sums |= count_false_cells(scan.points, label, result.height, scan.semantic)
+    if result.fit is not None and result.pose is not None:
+        sums |= _state(result.fit, result.pose)
+    if result.stages:
+        rows['times'] = [dict(result.stages)]
+    return {'scans': [sums], **rows}
+
+
+def _state(fit: FitReport, pose: SensorPose) -> dict[str, Any]:
+    """State of the learning and pose of the sensor, of our method; angles in radians."""
+    values = (
+        fit.status, fit.n_evaluations, fit.n_segments,
+        pose.height, pose.height_estimated, pose.roll, pose.pitch,
+    )  # fmt: skip
+    more = {'mode': fit.mode, 'backend': fit.backend, 'n_pseudo_inputs': fit.n_pseudo_inputs}
+    return dict(zip(STATE, values, strict=True)) | more

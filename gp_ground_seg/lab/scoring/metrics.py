@@ -1,27 +1,27 @@
-"""Conventions of ground; labels, probabilities and heights scored against the truth."""
+"""Conventions of ground; labels, probabilities and heights against the truth, as sums.
+
+Sums add up over scans. The ratios are functions of sums by name: of one scan, or of a frame of
+pandas, whose rows are scans or groups of them. Ratios over nothing are NaN.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.frame import FloatArray, Label
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
+from gp_ground_seg.core.frame import FloatArray, IntArray, Label
 
 Labels = npt.NDArray[np.uint8]
 
-RATIOS = ('precision', 'recall', 'f1', 'accuracy', 'iou')
-"""Ratios of a `Confusion`, by name of its property."""
+COUNTS = ('tp', 'fp', 'fn', 'tn')
+"""Points by true and given label, ground being positive."""
 
 
 def range_titles(edges: Sequence[float]) -> tuple[str, ...]:
@@ -35,6 +35,8 @@ def range_titles(edges: Sequence[float]) -> tuple[str, ...]:
 RING_EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, math.inf)
 """Edges of the rings of horizontal range [m]; each holds its inner edge, not its outer one."""
 RING_TITLES = range_titles(RING_EDGES)
+NO_RING = 'no range'
+"""Where points without a finite range are counted."""
 
 BIN_EDGES = np.linspace(0.0, 1.0, 16)
 """Edges of the bins of probability in the expected calibration error."""
@@ -89,93 +91,54 @@ height, is that of its published evaluation code."""
 CONVENTIONS = (GROUNDGRID, PATCHWORK)
 
 
-@dataclass(frozen=True)
-class Sums:
-    """A dataclass of counts and sums, which add up."""
-
-    def __add__(self, other: Self) -> Self:
-        """Add the sums of both."""
-        names = [entry.name for entry in dataclasses.fields(self)]
-        sums = {name: getattr(self, name) + getattr(other, name) for name in names}
-        return dataclasses.replace(self, **sums)
+def ratio(part: Any, whole: Any) -> Any:
+    """Return `part` / `whole` of numbers or columns, NaN where `whole` is zero."""
+    with np.errstate(invalid='ignore'):
+        return np.true_divide(part * (whole != 0), whole)
 
 
-@dataclass(frozen=True)
-class Confusion(Sums):
-    """Points by true and given label, ground being positive; ratios over nothing are NaN."""
-
-    tp: int = 0
-    fp: int = 0
-    fn: int = 0
-    tn: int = 0
-
-    @property
-    def precision(self) -> float:
-        """TP / (TP + FP)."""
-        return ratio(self.tp, self.tp + self.fp)
-
-    @property
-    def recall(self) -> float:
-        """TP / (TP + FN)."""
-        return ratio(self.tp, self.tp + self.fn)
-
-    @property
-    def f1(self) -> float:
-        """2 TP / (2 TP + FP + FN)."""
-        return ratio(2 * self.tp, 2 * self.tp + self.errors)
-
-    @property
-    def accuracy(self) -> float:
-        """(TP + TN) / (TP + FP + FN + TN)."""
-        return ratio(self.tp + self.tn, self.points)
-
-    @property
-    def iou(self) -> float:
-        """TP / (TP + FP + FN)."""
-        return ratio(*self.iou_sums)
-
-    @property
-    def iou_sums(self) -> tuple[int, int]:
-        """TP, and TP + FP + FN."""
-        return self.tp, self.tp + self.errors
-
-    @property
-    def points(self) -> int:
-        """TP + FP + FN + TN."""
-        return self.tp + self.tn + self.errors
-
-    @property
-    def errors(self) -> int:
-        """FP + FN."""
-        return self.fp + self.fn
+def label_ratios(sums: Any, prefix: str = '') -> dict[str, Any]:
+    """Return the ratios of `COUNTS`, whose names have the `prefix`, by name."""
+    tp, fp, fn, tn = (sums[f'{prefix}{name}'] for name in COUNTS)
+    return {
+        'precision': ratio(tp, tp + fp),
+        'recall': ratio(tp, tp + fn),
+        'f1': ratio(2 * tp, 2 * tp + fp + fn),
+        'accuracy': ratio(tp + tn, tp + fp + fn + tn),
+        'iou': ratio(tp, tp + fp + fn),
+    }
 
 
-def ratio(part: float, whole: float) -> float:
-    """Return `part` / `whole`, NaN where `whole` is zero."""
-    return part / whole if whole else math.nan
-
-
-def count_confusion(label: Labels, truth: Labels) -> Confusion:
-    """Compare given with true labels, (N,) each.
+def count_labels(label: Labels, truth: Labels) -> dict[str, int]:
+    """Compare given with true labels, (N,) each; return `COUNTS`.
 
     A given UNKNOWN counts as not ground; where the truth is UNKNOWN the point does not count.
     """
-    return count_rings(label, truth, np.zeros((len(label), 2)))[0]
+    (counts,) = _counts(label, truth, np.zeros(len(label), dtype=np.intp), 1)
+    return dict(zip(COUNTS, counts.tolist(), strict=True))
 
 
 def count_rings(
     label: Labels, truth: Labels, points: npt.NDArray[np.floating]
-) -> tuple[Confusion, ...]:
-    """Compare by horizontal range of `points` (N, >=2) [m], one `Confusion` for each ring.
+) -> list[dict[str, Any]]:
+    """Compare by horizontal range of `points` (N, >=2) [m], one row for each ring.
 
-    A point without a finite range is in no ring.
+    The last one, `NO_RING`, has the points without a finite range.
     """
-    ring, n_rings = ring_of(points), len(RING_TITLES)
-    scored = (ring < n_rings) & ((truth == Label.GROUND) | (truth == Label.OBSTACLE))
-    given, ground = label == Label.GROUND, truth == Label.GROUND
-    code = 4 * ring + 2 * given + ground
-    counts = np.bincount(code[scored], minlength=4 * n_rings).reshape(n_rings, 4)
-    return tuple(Confusion(int(tp), int(fp), int(fn), int(tn)) for tn, fn, fp, tp in counts)
+    titles = [*RING_TITLES, NO_RING]
+    counts = _counts(label, truth, ring_of(points), len(titles)).tolist()
+    return [
+        {'range': title, **dict(zip(COUNTS, own, strict=True))}
+        for title, own in zip(titles, counts, strict=True)
+    ]
+
+
+def _counts(label: Labels, truth: Labels, group: IntArray, n_groups: int) -> IntArray:
+    """Return `COUNTS` of each group, (n_groups, 4)."""
+    scored = (truth == Label.GROUND) | (truth == Label.OBSTACLE)
+    code = 4 * group + 2 * (label != Label.GROUND) + (truth != Label.GROUND)
+    # In the order of the codes: true and false positives, false and true negatives.
+    return np.bincount(code[scored], minlength=4 * n_groups).reshape(n_groups, 4)
 
 
 def ring_of(points: npt.NDArray[np.floating]) -> npt.NDArray[np.intp]:
@@ -198,44 +161,11 @@ def check_lengths(n_points: int, **values: Any) -> None:
             )
 
 
-@dataclass(frozen=True)
-class Calibration(Sums):
-    """Probabilities of ground against the truth, as sums; ratios over nothing are NaN.
+def count_bins(p_ground: npt.NDArray[np.floating], truth: Labels) -> list[dict[str, Any]]:
+    """Compare probabilities of ground, (N,), with true labels, (N,), one row for each bin.
 
-    Sums by bin of probability, (N_BINS,); a bin holds its lower edge, the last one 1 as well.
-    """
-
-    n_points: npt.NDArray[np.int64] = field(
-        default_factory=lambda: np.zeros(N_BINS, dtype=np.int64)
-    )
-    n_ground: npt.NDArray[np.int64] = field(
-        default_factory=lambda: np.zeros(N_BINS, dtype=np.int64)
-    )
-    sum_p: FloatArray = field(default_factory=lambda: np.zeros(N_BINS))
-
-    @property
-    def n_total(self) -> int:
-        """Points with a probability."""
-        return int(self.n_points.sum())
-
-    def by_bin(self, sums: npt.NDArray[Any]) -> FloatArray:
-        """Return `n_ground` or `sum_p` over the points of each bin, (N_BINS,)."""
-        return np.where(self.n_points > 0, sums, np.nan) / np.maximum(self.n_points, 1)
-
-    @property
-    def ece(self) -> float:
-        """Expected calibration error: mean over points of their bin's |share of ground - mean p|.
-
-        Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, for the
-        probability of one class of two.
-        """
-        return ratio(float(np.abs(self.n_ground - self.sum_p).sum()), self.n_total)
-
-
-def count_calibration(p_ground: npt.NDArray[np.floating], truth: Labels) -> Calibration:
-    """Compare probabilities of ground, (N,), with true labels, (N,).
-
-    Points whose probability is NaN or whose truth is UNKNOWN do not count.
+    A bin holds its lower edge, the last one 1 as well. Points whose probability is NaN or whose
+    truth is UNKNOWN do not count. `p` is the sum of the probabilities.
     """
     check_lengths(len(truth), p_ground=p_ground)
     known = ~np.isnan(p_ground)
@@ -244,11 +174,23 @@ def count_calibration(p_ground: npt.NDArray[np.floating], truth: Labels) -> Cali
     known &= (truth == Label.GROUND) | (truth == Label.OBSTACLE)
     ground, p = truth[known] == Label.GROUND, p_ground[known].astype(np.float64)
     bin_of = np.searchsorted(BIN_EDGES[1:-1], p, side='right')
-    return Calibration(
-        n_points=np.bincount(bin_of, minlength=N_BINS),
-        n_ground=np.bincount(bin_of[ground], minlength=N_BINS),
-        sum_p=np.bincount(bin_of, p, minlength=N_BINS).astype(np.float64),
+    sums = (
+        np.bincount(bin_of, minlength=N_BINS),
+        np.bincount(bin_of[ground], minlength=N_BINS),
+        np.bincount(bin_of, p, minlength=N_BINS).astype(np.float64),
     )
+    columns = zip(*(values.tolist() for values in sums), strict=True)
+    return [{'bin': k, 'n': n, 'n_ground': m, 'p': q} for k, (n, m, q) in enumerate(columns)]
+
+
+def calibration_error(sums: Any) -> float:
+    """Return the expected calibration error of a frame with a row for each bin.
+
+    It is the mean over the points of their bin's |share of ground - mean p|:
+    Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, for the probability of one
+    class of two.
+    """
+    return float(ratio((sums['n_ground'] - sums['p']).abs().sum(), sums['n'].sum()))
 
 
 FINEST_STD = 1e-3
@@ -259,96 +201,56 @@ TRIMMED = 1e-3
 lowest density: five returns that lie metres below the ground would decide it."""
 
 
-@dataclass(frozen=True)
-class HeightError(Sums):
-    """Errors of the surface under points whose ground height is known; over no points NaN.
-
-    Points without a surface do not count. The error is estimate minus truth.
-    """
-
-    n_points: int = 0
-    n_without_model: int = 0
-    sum_error: float = 0.0  # [m]
-    sum_squared_error: float = 0.0  # [m^2]
-    sum_squared_deviation: float = 0.0  # of the truth from its mean in the frame [m^2]
-    n_with_std: int = 0  # points whose standard deviation is known
-    n_within_1: int = 0  # of these the ones with an error of at most one standard deviation
-    n_within_2: int = 0
-    # Negative logs of the predictive density per metre, but for the worst `TRIMMED` of a frame
-    sum_nlpd: float = 0.0
-    n_nlpd: int = 0
-    medians: tuple[float, ...] = ()  # median absolute error of each frame [m]
-
-    @property
-    def median_absolute(self) -> float:
-        """Median over the frames of the median absolute error [m]."""
-        return float(np.median(self.medians)) if self.medians else math.nan
-
-    @property
-    def rmse(self) -> float:
-        """Root mean squared error [m]."""
-        return math.sqrt(ratio(self.sum_squared_error, self.n_points))
-
-    @property
-    def bias(self) -> float:
-        """Mean error [m]; negative where the surface is too low."""
-        return ratio(self.sum_error, self.n_points)
-
-    @property
-    def smse(self) -> float:
-        """Standardised mean squared error, mean((y - mu)^2) / var(y) (paper, section IV)."""
-        return ratio(self.sum_squared_error, self.sum_squared_deviation)
-
-    @property
-    def within_1(self) -> float:
-        """Share within one standard deviation; 0.683 of a normal distribution."""
-        return ratio(self.n_within_1, self.n_with_std)
-
-    @property
-    def within_2(self) -> float:
-        """Share within two standard deviations; 0.954 of a normal distribution."""
-        return ratio(self.n_within_2, self.n_with_std)
-
-    @property
-    def nlpd(self) -> float:
-        """Mean negative log predictive density (Rasmussen and Williams, 2006, section 2.5).
-
-        The worst `TRIMMED` of each frame is left out.
-        """
-        return ratio(self.sum_nlpd, self.n_nlpd)
-
-
-def height_error(
+def height_sums(
     truth: npt.NDArray[np.floating],
     estimate: npt.NDArray[np.floating],
     std: npt.NDArray[np.floating] | None = None,
-    max_nlpd: float | None = None,
-) -> HeightError:
-    """Compare true with estimated heights of the ground, (n,) [m]; NaN where there is no model.
+) -> dict[str, Any]:
+    """Compare true with estimated heights of the ground in a frame, (n,) [m].
 
-    `std` are the standard deviations of the differences, (n,) [m], if there are any. `max_nlpd` is
-    that of the frame, if these points are a part of it.
+    Points whose estimate is NaN, as there is no model, are in `n_without_model` only. `std` are
+    the standard deviations of the differences, (n,) [m], if there are any. The error is estimate
+    minus truth; `deviation` is of the truth from its mean. `median_absolute` is no sum.
     """
     known = np.isfinite(estimate)
     y = truth[known].astype(np.float64)
     error = estimate[known] - y
     spread = np.full(len(y), np.nan) if std is None else std[known]
     nlpd = negative_log_density(error, spread)
-    counts = nlpd <= (largest_nlpd(nlpd) if max_nlpd is None else max_nlpd)
-    return HeightError(
-        n_points=len(y),
-        n_without_model=len(truth) - len(y),
-        sum_error=float(error.sum()),
+    counts = nlpd <= largest_nlpd(nlpd)
+    return {
+        'n_points': len(y),
+        'n_without_model': len(truth) - len(y),
+        'error': float(error.sum()),  # [m]
         # Of a product of vectors the last digits depend on the number of threads.
-        sum_squared_error=float(np.square(error).sum()),
-        sum_squared_deviation=float(np.sum((y - y.mean()) ** 2)) if len(y) else 0.0,
-        n_with_std=int(np.isfinite(spread).sum()),
-        n_within_1=int((np.abs(error) <= spread).sum()),
-        n_within_2=int((np.abs(error) <= 2.0 * spread).sum()),
-        sum_nlpd=float(nlpd[counts].sum()),
-        n_nlpd=int(counts.sum()),
-        medians=(float(np.median(np.abs(error))),) if len(y) else (),
-    )
+        'square': float(np.square(error).sum()),  # [m^2]
+        'deviation': float(np.sum((y - y.mean()) ** 2)) if len(y) else 0.0,  # [m^2]
+        'n_with_std': int(np.isfinite(spread).sum()),
+        'n_within_1': int((np.abs(error) <= spread).sum()),
+        'n_within_2': int((np.abs(error) <= 2.0 * spread).sum()),
+        'sum_nlpd': float(nlpd[counts].sum()),
+        'n_nlpd': int(counts.sum()),
+        'median_absolute': float(np.median(np.abs(error))) if len(y) else math.nan,
+    }
+
+
+def height_ratios(sums: Any) -> dict[str, Any]:
+    """Return the ratios of `height_sums`, by name; lengths in metres.
+
+    RMSE; bias, the mean error; the standardised mean squared error, mean((y - mu)^2) / var(y)
+    (paper, section IV); the shares within one and two standard deviations, of a normal
+    distribution 0.683 and 0.954; the mean negative log predictive density (Rasmussen and
+    Williams, 2006, section 2.5) without the worst `TRIMMED` of each frame.
+    """
+    n = sums['n_points']
+    return {
+        'rmse': np.sqrt(ratio(sums['square'], n)),
+        'bias': ratio(sums['error'], n),
+        'smse': ratio(sums['square'], sums['deviation']),
+        'within_1': ratio(sums['n_within_1'], sums['n_with_std']),
+        'within_2': ratio(sums['n_within_2'], sums['n_with_std']),
+        'nlpd': ratio(sums['sum_nlpd'], sums['n_nlpd']),
+    }
 
 
 def negative_log_density(error: FloatArray, std: FloatArray) -> FloatArray:

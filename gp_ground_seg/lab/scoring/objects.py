@@ -10,8 +10,8 @@ part is cut off, and **false cells**, ground that a costmap takes for an obstacl
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, Label
-from gp_ground_seg.lab.scoring.metrics import Labels, Sums, check_lengths, range_titles, ratio
+from gp_ground_seg.lab.scoring.metrics import Labels, check_lengths, range_titles
 
 MIN_HEIGHT = 0.3
 """Height above the local ground from which on a return on an object counts [m]."""
@@ -55,7 +55,7 @@ SHARES = {
     'road_cells': 'cells of road called obstacle',
     'ground_cells': 'cells of ground called obstacle',
 }
-"""Shares that are counted, in words."""
+"""Shares that are counted, in words; of each the sums are ``NAME_n`` and ``NAME_wrong``."""
 CUT_HEIGHT = 0.45
 """Height above the ground at which labelled objects are cut [m]."""
 LOW_OVER, LOW_RANGE, LOW_N_GROUND = 0.15, 25.0, 5
@@ -82,30 +82,16 @@ class Objects:
     ground_z: npt.NDArray[np.floating]
 
 
-@dataclass(frozen=True)
-class ObjectCount(Sums):
-    """Returns on objects, from `MIN_HEIGHT` above the ground, and objects; over nothing NaN."""
-
-    n_returns: int = 0
-    n_ground: int = 0  # of these called ground
-    n_objects: int = 0  # with at least `MIN_RETURNS` of them
-    n_lost: int = 0  # of these objects, with more than half of them called ground
-    n_unknown: int = 0  # returns at any height that do not count, as their ground is not known
-
-    @property
-    def share_ground(self) -> float:
-        """Share of the returns that is called ground."""
-        return ratio(self.n_ground, self.n_returns)
-
-
-ObjectCounts = dict[str, tuple[ObjectCount, ...]]
-"""By class, in each by `BAND_TITLES`."""
+OBJECT_COUNTS = ('n_returns', 'n_ground', 'n_objects', 'n_lost', 'n_unknown')
+"""Returns from `MIN_HEIGHT` above the ground, and those called ground; objects with at least
+`MIN_RETURNS` of them, and those with more than half of them called ground; returns at any height
+that do not count, as their ground is not known."""
 
 
 def count_objects(
     points: npt.NDArray[np.floating], label: Labels, objects: Objects
-) -> ObjectCounts:
-    """Count returns on objects and objects that are called ground.
+) -> list[dict[str, Any]]:
+    """Count returns on objects and objects called ground, in a row for each class and band.
 
     `points` (N, >=3) are x, y, z [m], `label` (N,) what a method says of them; UNKNOWN is not
     ground. A return counts in the band of its horizontal range, an object in that of the
@@ -133,11 +119,12 @@ def count_objects(
     lost = 2 * n_ground[enough] > n_returns[enough]
     found = _by_class_and_band(of_object[enough, 0], middle[enough], lost, n_classes)
     bands = np.concatenate([returns, found, unknown[:, :, :1]], axis=2)
-    return {
-        name: tuple(ObjectCount(*numbers) for numbers in found.tolist())
-        for name, found in zip(CLASSES, bands, strict=True)
-        if found.any()
-    }
+    return [
+        {'class': name, 'range': band, **dict(zip(OBJECT_COUNTS, numbers, strict=True))}
+        for name, found in zip(CLASSES, bands.tolist(), strict=True)
+        if any(map(any, found))
+        for band, numbers in zip(BAND_TITLES, found, strict=True)
+    ]
 
 
 def _is_low(class_of: npt.NDArray[np.integer]) -> BoolArray:
@@ -158,15 +145,6 @@ def _by_class_and_band(
 def _medians(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
     """Median of the values of each group; `ndimage` refuses none at all."""
     return np.asarray(ndimage.median(values, group, range(n_groups)) if n_groups else values)
-
-
-def pool_objects(counts: Sequence[ObjectCounts]) -> ObjectCounts:
-    """Sum up the counts of several scans."""
-    pooled: ObjectCounts = {}
-    for name, bands in (item for of_scan in counts for item in of_scan.items()):
-        before = pooled.get(name, (ObjectCount(),) * len(bands))
-        pooled[name] = tuple(a + b for a, b in zip(before, bands, strict=True))
-    return {name: pooled[name] for name in CLASSES if name in pooled}
 
 
 def local_ground(
@@ -212,29 +190,6 @@ def labelled_objects(
 
 
 @dataclass(frozen=True)
-class Share(Sums):
-    """Returns or cells, and how many of them have the wrong label; over nothing NaN."""
-
-    n: int = 0
-    n_wrong: int = 0
-
-    @property
-    def ratio(self) -> float:
-        """Share that is wrong."""
-        return ratio(self.n_wrong, self.n)
-
-
-Shares = dict[str, Share]
-"""By `SHARES`, those that are known."""
-
-
-def pool_shares(shares: Sequence[Mapping[str, Share]]) -> Shares:
-    """Sum up the shares of several scans."""
-    names = [name for name in SHARES if any(name in own for own in shares)]
-    return {name: sum((own.get(name, Share()) for own in shares), Share()) for name in names}
-
-
-@dataclass(frozen=True)
 class CutScan:
     """A scan of N points without what is high of its objects.
 
@@ -247,10 +202,11 @@ class CutScan:
     is_kept: BoolArray
     is_low: BoolArray
 
-    def count(self, label: Labels) -> Share:
+    def count(self, label: Labels) -> dict[str, int]:
         """Count low returns called ground; `label` is of those left, in their order."""
         is_low = self.is_low[self.is_kept]
-        return Share(int(is_low.sum()), int((label[is_low] == Label.GROUND).sum()))
+        n_wrong = int((label[is_low] == Label.GROUND).sum())
+        return {f'{LOW_THINGS}_n': int(is_low.sum()), f'{LOW_THINGS}_wrong': n_wrong}
 
 
 def cut_objects(
@@ -278,7 +234,7 @@ def count_false_cells(
     label: Labels,
     height: npt.NDArray[np.floating],
     semantic: npt.NDArray[np.integer],
-) -> Shares:
+) -> dict[str, int]:
     """Count cells of labelled ground, and those that a costmap takes for an obstacle.
 
     A cell is false where one of its returns of ground (`semantic`, (N,)) is called obstacle
@@ -289,9 +245,9 @@ def count_false_cells(
     x, y = np.floor(points[near, :2] / FALSE_SIZE).T
     cell = x + 1j * y
     is_false = (label[near] == Label.OBSTACLE) & (height[near] >= FALSE_OVER)
-    found = {}
+    found = dict[str, int]()
     for name, numbers in CELLS.items():
         own = np.isin(semantic[near], numbers)
         n_cells, n_false = (len(np.unique(cell[part])) for part in (own, own & is_false))
-        found[name] = Share(n_cells, n_false)
+        found |= {f'{name}_n': n_cells, f'{name}_wrong': n_false}
     return found

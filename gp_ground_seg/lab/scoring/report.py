@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 import gp_ground_seg
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.export import differences
 from gp_ground_seg.core.parameters.schema import ParameterValue
-from gp_ground_seg.core.result import FitReport
 from gp_ground_seg.lab.scale.cluster import package_versions
 
 WIDTH = 100
@@ -33,21 +34,33 @@ class Column:
 
     `format` is that of its numbers, such as ``.2f``; ``_d`` separates thousands by spaces.
     Without one the column holds text and is aligned left. `key` is its name in JSON, the title
-    by default, `scale` the factor between what a row holds and what is shown.
+    by default, `scale` the factor between what a cell holds and what is shown. Where the rows
+    have units of their own, format and scale are tuples, with an entry for each row.
     """
 
     title: str
-    format: str = ''
+    format: str | tuple[str, ...] = ''
     key: str = ''
-    scale: float = 1
+    scale: float | tuple[float, ...] = 1
 
-    def show(self, value: Cell) -> str:
-        """Return a cell as it is shown."""
+    def show(self, value: Cell, row: int = 0) -> str:
+        """Return a cell of a row as it is shown."""
         if isinstance(value, str):
             return value
         if value is None or math.isnan(value):
             return '-'
-        return format(self.scale * value, self.format).replace('_', ' ')
+        form = self.format if isinstance(self.format, str) else self.format[row]
+        scale = self.scale if isinstance(self.scale, int | float) else self.scale[row]
+        number = round(scale * value) if form.endswith('d') else scale * value
+        return format(number, form).replace('_', ' ')
+
+    def plain(self, value: Any) -> Cell:
+        """Return a cell as it is in JSON: a number is one of Python, and not scaled."""
+        if value is None or isinstance(value, str):
+            return value
+        if math.isnan(value):
+            return None
+        return int(value) if str(self.format).endswith('d') else float(value)
 
 
 def percent(title: str, key: str = '', form: str = '.2f') -> Column:
@@ -65,34 +78,30 @@ def milliseconds(title: str, key: str = '') -> Column:
     return Column(title, '.1f', key, 1e3)
 
 
-Row = list[tuple[Column, Cell]]
-"""A row that names the column of each cell."""
-
-
 @dataclass(frozen=True)
 class Table:
-    """Rows of unscaled numbers and text; the columns of the first are those of the table.
+    """Columns of unscaled numbers and text, such as those of a frame of pandas.
 
     The title stands above it, notes below; `n_sums` rows at the end are set apart in `text`.
     """
 
-    rows: Sequence[Row]
+    columns: Mapping[Column, Iterable[Any]]
     title: str = ''
     notes: Sequence[str] = ()
     n_sums: int = 0
 
     def text(self) -> str:
-        """Return aligned text, columns two spaces apart."""
+        """Return aligned text, columns two spaces apart; of no rows neither titles."""
         above = [fold(self.title)] if self.title else []
         below = ['', *map(fold, self.notes)] if self.notes else []
         return '\n'.join([*above, *self._lines(), *below])
 
     def _lines(self) -> list[str]:
-        if not self.rows:
-            return []
         lines = self._shown()
+        if len(lines) == 1:
+            return []
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        marks = ['>' if column.format else '<' for column, _ in self.rows[0]]
+        marks = ['>' if column.format else '<' for column in self.columns]
         form = '  '.join(f'{{:{mark}{w}}}' for mark, w in zip(marks, widths, strict=True))
         text = [form.format(*line).rstrip() for line in lines]
         rule = '-' * (sum(widths) + 2 * (len(widths) - 1))
@@ -104,20 +113,23 @@ class Table:
     def markdown(self) -> str:
         """Return a Markdown table, title and notes as paragraphs."""
         titles, *rows = self._shown()
-        rule = ['--:' if column.format else '---' for column, _ in (self.rows or [[]])[0]]
+        rule = ['--:' if column.format else '---' for column in self.columns]
         table = '\n'.join(f'| {" | ".join(line)} |' for line in [titles, rule, *rows])
         return '\n\n'.join([*([self.title] if self.title else []), table, *self.notes])
 
     def json(self) -> list[dict[str, Any]]:
         """Return one object per row, unscaled."""
-        return [
-            {column.key or column.title: _plain(cell) for column, cell in row} for row in self.rows
-        ]
+        keys = [column.key or column.title for column in self.columns]
+        cells = ([column.plain(cell) for cell in own] for column, own in self.columns.items())
+        return [dict(zip(keys, row, strict=True)) for row in zip(*cells, strict=True)]
 
     def _shown(self) -> list[list[str]]:
         """Titles and rows, every cell as it is shown."""
-        titles = [column.title for column, _ in (self.rows or [[]])[0]]
-        return [titles, *([column.show(cell) for column, cell in row] for row in self.rows)]
+        shown = (
+            [column.title, *(column.show(cell, row) for row, cell in enumerate(cells))]
+            for column, cells in self.columns.items()
+        )
+        return [list(line) for line in zip(*shown, strict=True)]
 
 
 def fold(line: str) -> str:
@@ -133,7 +145,9 @@ def written(tables: Iterable[Table], lines: Sequence[str], *, markdown: bool) ->
 
 
 def _plain(value: Any) -> Any:
-    """Nested mappings and sequences with NaN as None: JSON has no NaN."""
+    """Nested mappings and sequences with numbers of Python, NaN as None: JSON has no NaN."""
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, dict):
         return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -161,13 +175,13 @@ def describe_environment(*packages: str) -> dict[str, Any]:
     }
 
 
-def machine_line(environment: Mapping[str, Any], fit: FitReport | None = None) -> str:
+def machine_line(environment: Mapping[str, Any], backend: str = '') -> str:
     """One line on where a measurement ran."""
     cores = '1 core' if environment['n_cores'] == 1 else f'{environment["n_cores"]} cores'
-    if fit is not None:
+    if backend:
         n_workers = environment.get('n_workers')
         threads = f'workers with {n_workers} threads in all' if n_workers else '1 thread'
-        cores = f'{threads} on {cores}, {fit.backend}'
+        cores = f'{threads} on {cores}, {backend}'
     versions = ', '.join(f'{name} {v or "absent"}' for name, v in environment['versions'].items())
     machine = f'machine: {environment["cpu"]}, {cores}; Python {environment["python"]}, {versions}'
     if not environment['commit']:
@@ -217,18 +231,18 @@ def _git(folder: Path, *words: str) -> str | None:
 
 
 class Report(NamedTuple):
-    """Tables to show, every number by scan or segment, a fit (of any frame), further facts."""
+    """Tables to show, every number by scan or segment, backend, further facts."""
 
     tables: dict[str, Table]
     rows: list[dict[str, Any]]
-    fit: FitReport
+    backend: str
     facts: dict[str, Any]
 
     def write(self, path: Path, environment: dict[str, Any]) -> None:
         """Write every number as JSON."""
         document = {
             **self.facts,
-            'backend': self.fit.backend,
+            'backend': self.backend,
             'environment': environment,
             **{name: table.json() for name, table in self.tables.items()},
             'rows': self.rows,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -14,13 +13,8 @@ from gp_ground_seg.data.colours import COLOURS, HEIGHTS, ramp_colours
 from gp_ground_seg.data.inputs import Input
 from gp_ground_seg.data.semantic_kitti import read_entries
 from gp_ground_seg.lab.plotting.style import GREEN
-from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_confusion
-from gp_ground_seg.lab.scoring.objects import (
-    ObjectCount,
-    Objects,
-    count_objects,
-    labelled_objects,
-)
+from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_labels, label_ratios
+from gp_ground_seg.lab.scoring.objects import Objects, count_objects, labelled_objects
 
 Colours = npt.NDArray[np.uint8]
 BLACK = '#111111'
@@ -46,10 +40,10 @@ class View(NamedTuple):
         """Return IoU [%], objects lost and objects; nothing where the truth is not known."""
         if self.truth is None or self.objects is None:
             return {}
-        bands = count_objects(self.points, label, self.objects).values()
-        found = sum(itertools.chain(*bands), ObjectCount())
-        iou = 100.0 * count_confusion(label, self.truth).iou
-        return {'IoU': iou, 'lost': found.n_lost, 'objects': found.n_objects}
+        rows = count_objects(self.points, label, self.objects)
+        n_lost, n_objects = (sum(row[name] for row in rows) for name in ('n_lost', 'n_objects'))
+        iou = 100.0 * label_ratios(count_labels(label, self.truth))['iou']
+        return {'IoU': iou, 'lost': n_lost, 'objects': n_objects}
 
 
 def read_view(item: Input, labels: str | None = None) -> View:
