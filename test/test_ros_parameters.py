@@ -17,13 +17,11 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from ros_helpers import bench, street, to_message
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
-from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.config import find_spec, parameter_specs
 from gp_ground_seg.core.parameters.export import file_problems
 from gp_ground_seg.core.parameters.presets import PRESETS
 from gp_ground_seg.core.parameters.removed import REMOVED
-from gp_ground_seg.ros.parameters import set_remotely
 from gp_ground_seg.ros.warm_up import CHANGED
 
 TYPES = {
@@ -358,23 +356,3 @@ def test_a_given_height_is_not_doubted_before_the_first_cloud(tmp_path):
         log = ros.said_by(stderr, CHANGED)
     assert 'sensor.height: 4.5 m' in log
     assert 'is sensor.height right' not in log
-
-
-@pytest.mark.slow
-def test_parameters_are_set_from_another_process(b):
-    """By the function behind the button of ``tune``."""
-    name = b.node.get_fully_qualified_name()
-    with ros.isolated():
-        set_remotely(name, {'label.ground_tolerance': 0.2, 'sensor.height': 1.2})
-        expected = Config().replace(**{'label.ground_tolerance': 0.2, 'sensor.height': 1.2})
-        assert b.node.config == expected
-        with pytest.raises(DataError, match=r'label\.ground_tolerance = 9\.0: must be a number'):
-            set_remotely(name, {'label.ground_tolerance': 9.0})
-        assert b.node.config == expected
-
-
-@pytest.mark.slow
-def test_parameters_of_a_node_that_is_not_there(b):
-    name = b.node.get_fully_qualified_name()
-    with ros.isolated(), pytest.raises(DataError, match=f'/nobody: no such node.*{name}'):
-        set_remotely('/nobody', {'label.ground_tolerance': 0.2})

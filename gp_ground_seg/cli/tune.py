@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
+import shlex
 from pathlib import Path
 
 from gp_ground_seg.cli import options
@@ -17,14 +17,13 @@ from gp_ground_seg.lab.viewers.tuner import Tuner, tunable
 DESCRIPTION = """\
 Show a scan in the browser, with sliders and boxes for the parameters. Labels follow at once,
 and points that change their class have a colour. With labels of SemanticKITTI, IoU and objects
-lost are shown too. Buttons write the parameters as YAML and, with ROS, set them in a running
-node. The page is served to this machine only. Ctrl-C stops it.
+lost are shown too. A button writes the parameters as YAML, and a line tells how to load the file
+into a running node. The page is served to this machine only. Ctrl-C stops it.
 """
 EXAMPLES = """\
   gp-ground-seg tune 000000.bin
   gp-ground-seg tune KITTI_ROOT/sequences/00 --frame 5 -o kitti.yaml
   gp-ground-seg tune drive.mcap --parameters label.ground_tolerance,faces.cell_size
-  gp-ground-seg tune drive.mcap --node /front/ground_segmentation_node
 
 needs the package viser (docs/install.md)
 """
@@ -47,8 +46,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--parameters', 'those to show (default: the basic ones)',
          {'metavar': 'NAME,NAME', 'type': names, 'default': basic}),
         ('-o --output', 'file to write (default: %(default)s)', {**file, 'default': 'tuned.yaml'}),
-        ('--node', 'node to set (default: %(default)s)',
-         {'metavar': 'NAME', 'default': f'/{NODE_NAME}'}),
         *options.CLOUDS,
         options.FORCE,
         options.QUIET,
@@ -62,26 +59,19 @@ def run(arguments: argparse.Namespace) -> int:
     inputs, config = options.list_clouds(arguments), options.read_config(arguments)
     output, is_ours = Path(arguments.output), arguments.force
     check_writable(output, force=is_ours)
+    load = f'ros2 param load /{NODE_NAME} {shlex.quote(str(output))}'
 
     def write(values: Config) -> str:
         nonlocal is_ours
         with staged_file(output, force=is_ours) as part:
             part.write_text(to_yaml(values, 'Found with gp-ground-seg tune.'), encoding='utf-8')
         is_ours = True
-        return f'written to {output}'
-
-    def apply(values: Config) -> str:
-        from gp_ground_seg.ros.parameters import set_remotely
-
-        set_remotely(arguments.node, {name: values[name] for name in arguments.parameters})
-        return f'{arguments.node} uses them'
+        return f'written to {output}; a running node takes it by {load}'
 
     with open_server(arguments.port) as (server, address):
         begin = arguments.parameters, arguments.labels, arguments.frame
         tuner = Tuner(server, inputs, config, *begin)
         tuner.add_button(f'write {output.name}', write)
-        if importlib.util.find_spec('rclpy'):
-            tuner.add_button(f'apply to {arguments.node}', apply)
         print(f'{address}\nCtrl-C ends it.', flush=True)
         tuner.run()
     return 0

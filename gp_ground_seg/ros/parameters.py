@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
-import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import SetParametersResult as Result
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.parameter_client import AsyncParameterClient
 from rclpy.parameter_service import ParameterService
 from rclpy.qos import qos_profile_parameters
 
-from gp_ground_seg.core.errors import ConfigError, DataError, GroundSegError
+from gp_ground_seg.core.errors import ConfigError, GroundSegError
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.export import differences
 from gp_ground_seg.core.parameters.removed import removal
-from gp_ground_seg.core.parameters.schema import OF_EVERY_NODE, ParameterSpec, ParameterValue
+from gp_ground_seg.core.parameters.schema import OF_EVERY_NODE, ParameterSpec
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
 from gp_ground_seg.ros.start_stop import start_errors
 
-REMOTE_TIMEOUT = 5.0  # of a node that is to be set [s]
 _NAMES = frozenset(spec.name for spec in parameter_specs())
 
 
@@ -111,7 +106,7 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._post_set)
         self._parameter_service = ParameterService(self)
-        # Its setters answer nothing at a value of unknown type, and one sets one by one.
+        # Of rclpy's own, a value of unknown type ends the executor, and one sets one by one.
         ours = {SetParameters: self._on_request, SetParametersAtomically: self._on_atomic_request}
         for setter in [service for service in self.services if service.srv_type in ours]:
             kind, name = setter.srv_type, setter.srv_name
@@ -214,27 +209,3 @@ def _unknown(name: str) -> str:
     except ConfigError as error:
         return str(error)
     return f'{name} is not declared'
-
-
-def set_remotely(node_name: str, values: Mapping[str, ParameterValue]) -> None:
-    """Set parameters of a node that runs; DataError if there is none, or it refuses any."""
-    context = Context()
-    rclpy.init(args=[], context=context)
-    node = Node('gp_ground_seg_tune', context=context, start_parameter_services=False)
-    executor = SingleThreadedExecutor(context=context)
-    try:
-        client = AsyncParameterClient(node, node_name)
-        if not client.wait_for_services(REMOTE_TIMEOUT):
-            found = ', '.join(sorted(node.get_fully_qualified_node_names())) or 'none'
-            raise DataError(f'{node_name}: no such node, or not ours; nodes here: {found}')
-        sent = [Parameter(name, value=value) for name, value in values.items()]
-        future = client.set_parameters(sent)
-        rclpy.spin_until_future_complete(node, future, executor, REMOTE_TIMEOUT)
-        if not future.done():
-            raise DataError(f'{node_name}: no answer in {REMOTE_TIMEOUT:g} s')
-        if refused := [r.reason for r in future.result().results if not r.successful]:
-            raise DataError(f'{node_name}: {refused[0]}')
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.shutdown(context=context)

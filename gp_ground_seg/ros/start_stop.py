@@ -33,11 +33,6 @@ from gp_ground_seg.core.parameters.export import file_problems
 from gp_ground_seg.core.parameters.schema import ROS_PARAMETERS_KEY, read_yaml
 
 HIGHEST_DOMAIN = 232
-_RULES = {
-    'remap': 'FROM:=TO, as in -r points:=/lidar',
-    'parameter': 'NAME:=VALUE, as in -p sensor.height:=1.2',
-}
-"""What rcl calls a rule, and its form."""
 LOG_FOLDER = 'set ROS_LOG_DIR to a folder that the node may write to'
 ROS_WHEELS = "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
 
@@ -80,8 +75,6 @@ def start_errors() -> Iterator[None]:
             raise
         # Without the places in the source code of rcl.
         text = re.sub(r', at \S+\.c:\d+', '', ' '.join(str(error).split()))
-        if rule := re.search(r"Couldn't parse (remap|parameter) .*rule: ('.*')\. Error", text):
-            raise ConfigError(f'{rule[2]}: must be {_RULES[rule[1]]}') from error
         kind = type(error).__name__
         is_of_log = text.startswith(('failed to initialize logging', 'Failed opening file'))
         text += f': {LOG_FOLDER}' if is_of_log else ''

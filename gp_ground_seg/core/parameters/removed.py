@@ -52,6 +52,7 @@ REMOVED: dict[str, str] = {
     f'{PROGRAM} segment --drop': (
         'leave it out: other topics are not copied; ros2 bag convert joins bags'
     ),
+    f'{PROGRAM} tune --node': 'use ros2 param load NODE FILE on the file that it writes',
     f'{PROGRAM} --dtype': 'save the numbers as float32, or as .npy, which knows its type',
     f'{PROGRAM} --origin': (
         "subtract it: xyz = points[:, :3] - (X, Y, Z); numpy.save('a.npy', xyz.astype('float32'))"
