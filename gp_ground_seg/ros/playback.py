@@ -17,7 +17,6 @@ from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.ros.input import cloud_profile
 
 DEPTH = 100  # clouds kept until acknowledged: with stock Fast DDS that can take 3 s
-LATE = 0.02  # a cloud that is sent more than this after its time is late [s]
 SLICE = 0.02  # longest wait in one piece [s]: /clock is published in between
 DELIVERY_TIMEOUT = 5.0  # of the last clouds [s]; Fast DDS asks for lost ones every 3 s
 
@@ -35,11 +34,9 @@ class Player:
 
     is_acknowledged = True
     """Whether every reliable subscriber has acknowledged all clouds at the end."""
-    n_unheard = 0
-    """Clouds that were sent while their topic had no subscriber."""
     _first_sent: float | None = None
-    _last_sent = _worst_delay = 0.0
-    _n_late = 0
+    _last_sent = 0.0
+    _n_sent = 0
 
     def __init__(
         self,
@@ -52,7 +49,6 @@ class Player:
         self._bag = bag
         self._options = options
         self._pause = pause
-        self._n_sent: Counter[str] = Counter()
         profile = cloud_profile(DEPTH)
         self._publishers = {t: node.create_publisher(PointCloud2, t, profile) for t in topics}
         # Reliable, which serves both kinds of subscribers.
@@ -83,14 +79,8 @@ class Player:
         """Return one line on what was played up to now; nothing if no cloud was sent."""
         if self._first_sent is None:
             return ''
-        n_sent, n_topics = self._n_sent.total(), len(self._n_sent)
-        seconds = self._last_sent - self._first_sent
-        rate = f' ({(n_sent / n_topics - 1) / seconds:.2f} Hz)' if seconds > 0.0 else ''
-        return (
-            f'{n_sent} cloud{"s" if n_sent != 1 else ""} sent in {seconds:.1f} s{rate}, '
-            f'{self._n_late} more than {1e3 * LATE:.0f} ms late (worst '
-            f'{1e3 * self._worst_delay:.1f} ms), {self.n_unheard} without a subscriber'
-        )
+        plural = 's' if self._n_sent != 1 else ''
+        return f'{self._n_sent} cloud{plural} sent in {self._last_sent - self._first_sent:.1f} s'
 
     def _play_once(self, start: float, on_cloud: Callable[[], object]) -> float:
         """Play from the monotonic time `start` on; return when the next round has to start."""
@@ -106,7 +96,7 @@ class Player:
             due = start + 1e-9 * (last - first) / rate
             self._wait_until(due, last)
             on_cloud()
-            self._send(topic, raw, due)
+            self._send(topic, raw)
             n_clouds[topic] += 1
         n_periods, span = max(n_clouds.values()) - 1, 1e-9 * (last - first)
         # A bag of a single cloud begins again after 0.1 s.
@@ -125,15 +115,12 @@ class Player:
         if self._clock is not None:
             self._clock.publish(Clock(clock=Time(nanoseconds=nanoseconds).to_msg()))
 
-    def _send(self, topic: str, raw: bytes, due: float) -> None:
-        publisher, now = self._publishers[topic], time.monotonic()
-        self.n_unheard += publisher.get_subscription_count() == 0
-        publisher.publish(raw)
-        self._n_sent[topic] += 1
-        self._first_sent = now if self._first_sent is None else self._first_sent
-        self._last_sent = now
-        self._n_late += now - due > LATE
-        self._worst_delay = max(self._worst_delay, now - due)
+    def _send(self, topic: str, raw: bytes) -> None:
+        self._last_sent = time.monotonic()
+        self._publishers[topic].publish(raw)
+        self._n_sent += 1
+        if self._first_sent is None:
+            self._first_sent = self._last_sent
 
     def _wait_for_delivery(self) -> None:
         """Wait until the last clouds are acknowledged: they go with their publisher."""
