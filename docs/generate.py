@@ -24,6 +24,7 @@ REMOVED_HEAD = """
 ## Removed
 
 A file or a command that has one of these ends with its line. The node leaves it out, and warns.
+Topics begin with `~/`: a subscriber of one gets no message.
 
 | Removed | Instead |
 | --- | --- |

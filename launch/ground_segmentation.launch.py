@@ -24,7 +24,7 @@ from launch_ros.actions import Node
 
 SHARE = Path(get_package_share_directory('gp_ground_seg'))
 OUTPUTS = ('ground', 'obstacles')
-OPTIONAL = ('labeled', 'ground_model', 'markers', 'scan', 'occupancy')
+OPTIONAL = ('labeled', 'ground_model', 'scan', 'occupancy')
 
 ARGUMENTS = (
     ('topic', 'points', 'PointCloud2 topic of the LiDAR'),

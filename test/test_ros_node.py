@@ -145,8 +145,7 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(tmp_path):
     assert model == MODEL_KEYS.split('; ')
     assert len(keys['model']) > len(model)
     topics = [f'{NAMESPACE}/ground', f'{NAMESPACE}/obstacles'] + [
-        f'{node_name}/{name}'
-        for name in ('labeled', 'ground_model', 'markers', 'scan', 'occupancy')
+        f'{node_name}/{name}' for name in ('labeled', 'ground_model', 'scan', 'occupancy')
     ]
     facts = ('subscribers', 'rate (Hz)', 'since startup')
     assert keys['output'] == [f'{topic} {fact}' for topic in topics for fact in facts]

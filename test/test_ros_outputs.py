@@ -9,7 +9,6 @@ import ros_helpers as ros
 from nav_msgs.msg import OccupancyGrid
 from ros_helpers import said_by, stderr_in, street, to_message, wait_for, xyz_of
 from sensor_msgs.msg import LaserScan, PointCloud2, PointField
-from visualization_msgs.msg import Marker, MarkerArray
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.parameters.schema import NODE_NAME
@@ -22,7 +21,7 @@ from gp_ground_seg.ros.outputs import LABELLED_FIELDS as FIELDS
 from gp_ground_seg.ros.outputs import labelled_names
 
 OPTIONAL = {
-    '~/labeled': PointCloud2, '~/ground_model': PointCloud2, '~/markers': MarkerArray,
+    '~/labeled': PointCloud2, '~/ground_model': PointCloud2,
     '~/scan': LaserScan, '~/occupancy': OccupancyGrid,
 }  # fmt: skip
 CONFIG = Config().replace(**{'learning.mode': 'fixed'})
@@ -82,42 +81,6 @@ def test_ground_model_gives_the_height_anywhere(b):
     columns = read_columns(found, ['range', 'roll', 'pitch'])
     assert np.isfinite(columns['range']).all()
     assert not columns['roll'].any()
-
-
-def test_markers_draw_profiles_and_band(b):
-    points = street(6000)
-    message = to_message(points, stamp=(17, 23), frame='velo_link')
-    profiles, band = received(b, '~/markers', message).markers
-    for marker, kind in ((profiles, Marker.LINE_LIST), (band, Marker.TRIANGLE_LIST)):
-        assert marker.header == message.header
-        assert (marker.type, marker.action) == (kind, Marker.ADD)
-        assert marker.pose.orientation.w == 1.0
-    lines = np.array([(p.x, p.y, p.z) for p in profiles.points]).reshape(-1, 2, 3)
-    corners = np.array([(p.x, p.y, p.z) for p in band.points]).reshape(-1, 6, 3)
-    assert 200 < len(lines) == len(corners) < 60 * 23 + 1
-    assert len(profiles.colors) == len(profiles.points)
-    assert {color.a for color in profiles.colors} == {1.0}
-    found = GroundSegmenter(CONFIG).segment(xyz_of(points)).corrected
-    at_ends = np.hypot(lines[..., 0], lines[..., 1])
-    knot = np.searchsorted(found.knots, at_ends - 1e-6)
-    np.testing.assert_allclose(at_ends, found.knots[knot])
-    # Two triangles: lower left, lower right, upper left; lower right, upper right, upper left.
-    lower, upper = corners[:, [0, 1]], corners[:, [5, 4]]
-    np.testing.assert_array_equal(corners[:, [3, 2]], np.stack([lower[:, 1], upper[:, 0]], axis=1))
-    np.testing.assert_allclose((lower + upper) / 2, lines, atol=1e-12)
-    half = (upper - lower)[..., 2] / 2
-    assert half.min() > 0.0
-    assert half.max() <= 2 * CONFIG.label.ground_tolerance
-    turn = np.arctan2(lines[..., 1], lines[..., 0]) / (2 * np.pi) + 0.5
-    segment = np.floor(turn * CONFIG.grid.n_segments).astype(int)
-    np.testing.assert_allclose(half, 2 * found.std[segment, knot])
-    np.testing.assert_allclose(lines[..., 2], found.mean[segment, knot])
-
-
-def test_markers_without_a_model_are_taken_away(b):
-    answer = received(b, '~/markers', to_message(street(0)))
-    assert [marker.action for marker in answer.markers] == [Marker.DELETE] * 2
-    assert not any(marker.points for marker in answer.markers)
 
 
 REDUCED = {

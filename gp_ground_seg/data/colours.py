@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray
@@ -43,13 +41,3 @@ def ramp_colours(values: FloatArray, low: float, high: float) -> FloatArray:
     colours = np.stack([np.interp(share, stops, channel) for channel in _RAMP.T], axis=-1)
     colours[~known] = UNKNOWN
     return colours
-
-
-def length_scale_colours(length_scale: FloatArray, low: float, high: float) -> FloatArray:
-    """Return `ramp_colours` on a log scale, dark blue on rough ground and yellow on smooth.
-
-    Infinite length-scales [m] and those that are not positive are not known. 0 < `low` < `high`.
-    """
-    known = np.isfinite(length_scale) & (length_scale > 0.0)
-    log = np.log(np.where(known, length_scale, 1.0))
-    return ramp_colours(np.where(known, log, np.nan), math.log(low), math.log(high))

@@ -8,20 +8,15 @@ from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Point
 from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import LaserScan, PointCloud2, PointField
-from std_msgs.msg import ColorRGBA, Header
-from visualization_msgs.msg import Marker, MarkerArray
+from std_msgs.msg import Header
 
-from gp_ground_seg.core.frame import NOT_FINITE, BoolArray, FloatArray, IntArray
-from gp_ground_seg.core.ground_model import GroundModel
-from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.frame import NOT_FINITE, BoolArray
 from gp_ground_seg.core.pipeline.tilt import rotate
 from gp_ground_seg.core.result import Segmentation
-from gp_ground_seg.data.colours import length_scale_colours
 from gp_ground_seg.data.costmap import (
     DIRECTIONS,
     SegmentedCloud,
@@ -42,12 +37,6 @@ from gp_ground_seg.ros.input import cloud_profile
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
-
-# rclpy takes some microseconds for each vertex: the markers are thinned to what can be told
-# apart by eye, so that a viewer costs the node less than the segmentation itself.
-MAX_PROFILES, MAX_KNOTS = 60, 24
-N_STD = 2.0  # half width of the band in standard deviations
-BAND_COLOUR = (0.75, 0.75, 0.75, 0.35)
 
 
 class Output(NamedTuple):
@@ -94,65 +83,6 @@ def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud
     known = read_xyz(cloud), *columns.values()
     message.is_dense = all(bool(np.isfinite(values).all()) for values in known)
     return message
-
-
-def markers(cloud: PointCloud2, segmentation: Segmentation, config: Config) -> MarkerArray:
-    """Return the ground model as a MarkerArray in the frame of `cloud`.
-
-    ``profiles``: ground height over range, coloured by length-scale from ``length_scale.min``
-    to ``length_scale.max``. ``band``: two standard deviations about it, vertical. Neither is
-    drawn where the standard deviation is above ``label.ground_tolerance``.
-    """
-    model = GroundModel.of(segmentation)
-    grid = np.ix_(_thin(len(model.height), MAX_PROFILES), _thin(len(model.knots), MAX_KNOTS))
-    points, std = model.knot_points()[grid], model.std[grid]
-    known = np.isfinite(points).all(axis=-1) & (std <= config.label.ground_tolerance)
-    # Left ends of the pieces between two knots that are both known.
-    left = np.flatnonzero(np.pad(known[:, :-1] & known[:, 1:], ((0, 0), (0, 1))))
-
-    ends = np.stack([left, left + 1], axis=-1).ravel()
-    profiles = _marker(cloud, 'profiles', Marker.LINE_LIST, points.reshape(-1, 3), ends)
-    profiles.scale.x = 0.04  # [m]
-    limits = config.length_scale.min, config.length_scale.max
-    rgb = length_scale_colours(model.length_scale[grid], *limits)
-    profiles.colors = _colours(rgb.reshape(-1, 3)[ends])
-
-    upper = points.size // 3
-    corners = [left, left + 1, left + upper, left + 1, left + 1 + upper, left + upper]
-    edges = [model.knot_points(sign * N_STD)[grid].reshape(-1, 3) for sign in (-1.0, 1.0)]
-    index = np.stack(corners, axis=-1).ravel()
-    band = _marker(cloud, 'band', Marker.TRIANGLE_LIST, np.concatenate(edges), index)
-    band.scale.x = band.scale.y = band.scale.z = 1.0
-    band.color.r, band.color.g, band.color.b, band.color.a = BAND_COLOUR
-    return MarkerArray(markers=[profiles, band])
-
-
-def _thin(count: int, most: int) -> IntArray:
-    """Up to `most` indices below `count`, evenly spread, with the first and the last."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
-
-
-def _marker(
-    cloud: PointCloud2, name: str, kind: int, vertices: FloatArray, index: IntArray
-) -> Marker:
-    # Viewers warn of a marker without vertices: it is deleted.
-    action = Marker.ADD if len(index) else Marker.DELETE
-    marker = Marker(header=cloud.header, ns=name, id=0, type=kind, action=action)
-    marker.pose.orientation.w = 1.0
-    # Pieces share the messages of their vertices: making them takes most of the time.
-    used = {
-        k: Point(**dict(zip('xyz', vertices[k].tolist(), strict=True)))
-        for k in np.unique(index).tolist()
-    }
-    marker.points = [used[k] for k in index.tolist()]
-    return marker
-
-
-def _colours(rgb: FloatArray) -> list[ColorRGBA]:
-    """Return the message of each colour (N, 3); similar ones share one."""
-    keys = [tuple(row) for row in (np.rint(rgb * 50.0) / 50.0).tolist()]
-    shared = {(r, g, b): ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in set(keys)}
-    return [shared[key] for key in keys]
 
 
 def _selected(segmented: SegmentedCloud, chosen: BoolArray, voxel: float) -> PointCloud2:
@@ -228,7 +158,6 @@ OUTPUTS = (
         lambda s: ground_model_cloud(s.cloud, s.segmentation),
         True,
     ),
-    Output('~/markers', MarkerArray, lambda s: markers(s.cloud, s.segmentation, s.config), True),
     Output('~/scan', LaserScan, scan, True),
     Output('~/occupancy', OccupancyGrid, occupancy_grid, True),
 )

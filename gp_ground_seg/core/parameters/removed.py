@@ -20,6 +20,7 @@ REMOVED: dict[str, str] = {
     'learning.warm_start': 'leave it out: learning starts from the lines of each frame',
     'learning.max_time': 'use learning.max_evaluations',
     'input.max_cloud_size': 'leave it out: clouds of any size are taken',
+    '~/markers': 'use ~/ground_model: RViz and Foxglove colour it by std or length_scale',
     'runtime.n_threads': 'leave it out: a scan takes one thread; --workers takes several scans',
     f'{PROGRAM} config diff': (
         f'use diff on two files, each written by {PROGRAM} config dump --config FILE'
@@ -64,7 +65,8 @@ REMOVED: dict[str, str] = {
 }
 """What to use instead, by the ``NAME`` of a parameter, by ``NAME=VALUE`` where only a value is
 removed, or by the first words of a command line: those of a command, of one below it, or of either
-and an option; of an option alone where every command had it."""
+and an option; of an option alone where every command had it. A topic of the node begins with
+``~/``: nothing refuses it."""
 
 
 def removal(name: str, value: object = None) -> str:
