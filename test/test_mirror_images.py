@@ -18,7 +18,7 @@ DRY = ['flat', 'ramp', 'rough', 'ditch', 'dike', 'hills', 'bank', 'urban', 'car_
 def images_in(points, sensor):
     """Which points are found to be images, and how high what they are images of is over them."""
     config = dataclasses.replace(Config(), sensor=sensor)
-    pose = GroundSegmenter(config).estimate_pose(points)
+    pose = GroundSegmenter(config).segment(points).pose
     scan = NumpyBackend().build_grid(pose.level(np.ascontiguousarray(points[:, :3])), config)
     found = find_mirror_images(scan, pose, sensor)
     is_image = np.zeros(len(points), dtype=bool)

@@ -170,7 +170,6 @@ def test_callers_whose_numpy_raises_get_the_same(backend, scan, tilt):
     places = np.concatenate([scan[:100, :2], [[30.0, 5e-324]]]).T
     heights, knots = model.at(*places), model.knot_points(1.0)
     with np.errstate(all='raise'):
-        assert segmenter.estimate_pose(scan[:1000]).height > 0.0
         result = segmenter.segment(scan, tilt)
         same(result, expected)
         assert result.fit.n_inliers == expected.fit.n_inliers
@@ -278,7 +277,6 @@ def test_times_come_from_the_clock_given_and_the_fit_report_counts(scan):
 def test_a_result_is_not_changed_by_the_next_scan(backend, scan):
     segmenter = GroundSegmenter(CONFIG, backend=backend)
     result = segmenter.segment(scan)
-    assert segmenter.estimate_pose(scan) == result.pose
     kept = {name: getattr(result, name).copy() for name in VALUES}
     groups = result.grid, result.candidates, result.lines, result.pseudo, result.surface
     before = [[np.copy(a) for a in group] for group in groups]
@@ -339,7 +337,7 @@ def test_callers_take_turns_while_the_segmenter_is_configured():
         results = callers.map(segmenter.segment, scans * fewer(10, 1))
         for _ in range(fewer(20, 1)):
             segmenter.configure(CONFIG.replace(**{'diagnostics.period': 2.0}))
-            segmenter.estimate_pose(scans[0][:100])
+            segmenter.segment(scans[0][:100])
     for k, result in enumerate(results):
         same(result, expected[k % len(scans)])
 

@@ -167,18 +167,6 @@ class GroundSegmenter:
             origin=np.array([sensor.origin_x, sensor.origin_y, sensor.origin_z]),
         )
 
-    @usual_errors()
-    def estimate_pose(self, points: npt.ArrayLike) -> SensorPose:
-        """Estimate height and tilt of the sensor as `segment` does, and no more.
-
-        Parameters and errors are those of `segment`.
-        """
-        with self._exclusive():
-            xyz, timer = take_points(points), StageTimer(self._clock)
-            _, pose, _ = self._level(xyz, self._config.sensor, timer)
-            self._warn(pose.warnings)
-            return pose
-
     @property
     def config(self) -> Config:
         """Parameters of the next scan."""
@@ -235,7 +223,7 @@ class GroundSegmenter:
         xyz: PointArray,
         sensor: SensorConfig,
         timer: StageTimer,
-        fallback: SensorPose | None = None,
+        fallback: SensorPose | None,
     ) -> tuple[Scan, SensorPose, MirrorImages]:
         """Scan in the level frame, with mirror images raised.
 

@@ -50,11 +50,11 @@ def take_points(points: npt.ArrayLike) -> PointArray:
         return array[:, :3].astype(dtype, copy=not array.flags.aligned)
 
 
+@np.errstate(all='ignore')
 def objection_to_ranges(xyz: PointArray) -> str:
     """Return what is wrong where points (N, 3) are farther away than a sensor measures, or ''."""
-    with np.errstate(invalid='ignore'):
-        is_beyond = np.abs(xyz).max(axis=1, initial=0.0) > FARTHEST
-        is_beyond &= np.isfinite(xyz).all(axis=1)
+    is_beyond = np.abs(xyz).max(axis=1, initial=0.0) > FARTHEST
+    is_beyond &= np.isfinite(xyz).all(axis=1)
     if is_beyond.sum() <= _MAX_BEYOND * len(xyz):
         return ''
     middle = ', '.join(f'{value:.1f}' for value in np.median(xyz[is_beyond], axis=0))
