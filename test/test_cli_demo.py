@@ -57,12 +57,12 @@ def perfect(n=40):
     return np.arange(n) % 2 == 0
 
 
-def confusion_of(cloud, results):
+def counts_of(cloud, results):
     """What a scan adds to the counts; it has come back exactly."""
     tally = Tally([stamp_of(cloud)])
     tally.add(cloud, results)
     assert (tally.n_points, tally.n_faulty) == (39, 0)
-    return tally.confusion
+    return tally.counts
 
 
 def test_labels_are_scored():
@@ -71,11 +71,9 @@ def test_labels_are_scored():
     assert is_exact
     assert label[3] == Label.UNKNOWN
     # The outlier does not count.
-    confusion = confusion_of(cloud, split(cloud, is_ground))
-    assert (confusion.tp, confusion.tn, confusion.errors) == (20, 19, 0)
+    assert counts_of(cloud, split(cloud, is_ground)) == {'tp': 20, 'fp': 0, 'fn': 0, 'tn': 19}
     is_ground[[0, 2, 5]] ^= True
-    confusion = confusion_of(cloud, split(cloud, is_ground))
-    assert (confusion.fn, confusion.fp) == (2, 1)
+    assert counts_of(cloud, split(cloud, is_ground)) == {'tp': 18, 'fp': 1, 'fn': 2, 'tn': 18}
 
 
 def chosen(n, *where):
@@ -153,7 +151,7 @@ def test_counts_and_words():
     results = split(clouds[4], perfect())
     results[GROUND] = select_points(results[GROUND], ~chosen(20, 1, 2))
     tally.add(clouds[4], results)
-    assert (tally.n_points, tally.n_faulty, tally.confusion.tp) == (117, 1, 20 + 0 + 18)
+    assert (tally.n_points, tally.n_faulty, tally.counts['tp']) == (117, 1, 20 + 0 + 18)
     # The middle one was lost: the one before it that came back.
     assert tally.picture[0] == 0
     assert 'FAILED: the two clouds are not the scan' in result_text(tally, result, 0, '')[0]
