@@ -336,8 +336,10 @@ def test_tables_hold_the_sums_of_the_frames(root, evaluated, capfd):
     for key, name in itertools.product(('groundgrid', 'patchwork'), ('00', '08', 'all')):
         ours, its = (
             label_ratios({
-                n: sum(f[f'{key}_{n}'] for f in frames
-                          if f['method'] == method and name in (f['sequence'], 'all'))
+                n: sum(
+                    f[f'{key}_{n}'] for f in frames
+                    if f['method'] == method and name in (f['sequence'], 'all')
+                )
                 for n in COUNTS
             })
             for method in ('gp_ground_seg', 'patchworkpp')
