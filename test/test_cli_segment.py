@@ -200,7 +200,6 @@ def expected_labels(segmenter, k, ground=40, obstacle=99):
     [
         ('velodyne', 'velodyne', 'velodyne_ground'),
         ('00/velodyne', '00', '00_ground'),
-        ('drive/velodyne_points/data', 'drive', 'drive_ground'),
         ('velodyne', 'velodyne/000000.bin', 'velodyne/000000_ground'),
         ('velodyne', '.', 'velodyne_ground'),
     ],
@@ -270,6 +269,12 @@ def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
         ('unfinished', [], r'no metadata\.yaml in it\); bag files in it.*: x_0\.mcap'),
         ('notes.md', [], r'not a scan or bag; accepted are \.bin'),
         ('good', ['-o', 'x.label'], r'x\.label: must be a folder'),
+        ('root', ['-o', 'x.ply'], r'x\.ply: must be a folder'),
+        (
+            'good/000000.bin',
+            ['-o', 'x.label', '--workers', '2'],
+            r'--workers: is for several inputs',
+        ),
         ('good', ['-o', 'notes.md'], r'notes\.md: is a file, must be a folder'),
     ],
 )

@@ -21,6 +21,7 @@ from torture_resume import (
     resize_output,
 )
 
+from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data import files
 
@@ -81,6 +82,20 @@ def test_what_is_there_is_kept_and_other_parameters_are_refused(root, tmp_path, 
     assert sorted(finished(out)) == sorted(before)
     assert run('config', 'check', out / 'parameters.yaml') == 0
     assert '1 differs from the defaults' in capsys.readouterr().out
+
+
+def test_a_folder_goes_on_with_the_backend_that_it_was_begun_with(root, tmp_path, monkeypatch):
+    """Whatever has been compiled meanwhile; values differ in their last digits."""
+    source, out, whole = root / 'sequences/00', tmp_path / 'out', tmp_path / 'whole'
+    monkeypatch.setattr(options, 'has_to_compile', lambda: True)
+    for folder in (out, whole):
+        assert run('segment', source, '-o', folder, '--format', 'ply') == 0
+    (out / '000003.ply').unlink()
+    monkeypatch.setattr(options, 'has_to_compile', lambda: False)
+    assert run('segment', source, '-o', out, '--format', 'ply') == 0
+    for file in whole.glob('*.ply'):
+        assert (out / file.name).read_bytes() == file.read_bytes()
+    assert 'backend: numpy' in (out / 'parameters.yaml').read_text()
 
 
 def test_files_of_the_user_are_kept(root, tmp_path, capsys):

@@ -18,12 +18,13 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.atomic_output import check_writable
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.bag_output import write_bag
-from gp_ground_seg.data.cloud_files import SUFFIXES, WRITABLE, read_file
+from gp_ground_seg.data.cloud_files import read_file
 from gp_ground_seg.data.cloud_output import FORMATS, LABELS, format_for
-from gp_ground_seg.data.inputs import Input, Inputs, holds_bag, list_inputs
+from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences
 from gp_ground_seg.lab.scale.cluster import cut
 from gp_ground_seg.lab.scale.dataset import (
+    PARAMETERS,
     Item,
     Outcome,
     Record,
@@ -100,6 +101,8 @@ def run(arguments: argparse.Namespace) -> int:
     elif holds_bag(source) and arguments.format not in FORMATS:
         bag = _bag_item(source, target.name, arguments, force=arguments.force)
         _segment_to(target, bag, arguments, config)
+    elif _is_root(source):
+        _segment_into(target, _list_root(arguments), arguments, config)
     else:
         _segment_scans(target, arguments, config)
     return 0
@@ -108,34 +111,30 @@ def run(arguments: argparse.Namespace) -> int:
 def _segment_scans(target: Path, arguments: argparse.Namespace, config: Config) -> None:
     """Segment scans, or the clouds of a bag, into files."""
     source, form = Path(arguments.input), arguments.format
-    is_root = _is_root(source)
-    scans = Inputs(source, ()) if is_root else options.list_clouds(arguments)
-    is_file = target.suffix[1:] in FORMATS
-    is_single = not (source.is_dir() or holds_bag(source))
-    if is_file and not is_single:
-        raise DataError(f'{target}: must be a folder, {source} has several scans')
-    if target.suffix and is_single and not (is_file or target.is_dir()):
-        raise DataError(f'{target}: must be a folder, or end in .{", .".join(FORMATS)}')
-    if is_file and form not in (None, target.suffix[1:]):
-        raise DataError(f'{target}: ends in {target.suffix}, which is not {form}')
-    names = [f'{scan.name}.{format_for(scan.path, form)}' for scan in scans]
-    if is_root:
-        _segment_into(target, _list_root(arguments), arguments, config)
-    elif is_file:
-        scan = scans[0]
-        item = Item(scan.path, [target.name], partial(write_scans, [scan], [target.name]))
+    scans = options.list_clouds(arguments)
+    is_single = not (source.is_dir() or scans.topic)
+    if is_single and target.suffix[1:] in FORMATS:
+        if form not in (None, target.suffix[1:]):
+            raise DataError(f'{target}: ends in {target.suffix}, which is not {form}')
+        item = Item(source, [target.name], partial(write_scans, scans, [target.name]))
         _segment_to(target, item, arguments, config)
-    elif holds_bag(source):
-        bag = Item(source, names, partial(write_scans, scans, names), len(scans))
-        _segment_into(target, [bag], arguments, config)
+        return
+    if is_single and target.suffix and not target.is_dir():
+        raise DataError(f'{target}: must be a folder, or end in .{", .".join(FORMATS)}')
+    names = [f'{scan.name}.{format_for(scan.path, form)}' for scan in scans]
+    if scans.topic:
+        items = [Item(source, names, partial(write_scans, scans, names), len(scans))]
     else:
         pairs = zip(scans, names, strict=True)
         items = [Item(s.path, [name], partial(write_scans, [s], [name])) for s, name in pairs]
-        _segment_into(target, items, arguments, config)
+    _segment_into(target, items, arguments, config)
 
 
 def _segment_to(target: Path, item: Item, arguments: argparse.Namespace, config: Config) -> None:
     """Segment one input into one file or bag."""
+    for name in 'workers', 'scheduler':
+        if vars(arguments)[name] is not None:
+            raise DataError(f'--{name}: is for several inputs')
     if target.resolve() == item.path.resolve():
         raise DataError(f'{target}: is the input; name another output')
     if target.suffix[1:] in FORMATS:
@@ -151,12 +150,20 @@ def _segment_into(
     folder: Path, items: list[Item], arguments: argparse.Namespace, config: Config
 ) -> None:
     """Segment what is left of several inputs into a folder."""
+    if folder.suffix[1:] in FORMATS:
+        raise DataError(f'{folder}: must be a folder')
     if not folder.resolve().parent.is_dir():
         raise DataError(f'{folder}: the folder {folder.resolve().parent} does not exist')
     title = f'written by gp-ground-seg segment {__version__}'
     for name in 'topic', 'columns':
         title += f', {name} {value}' if (value := vars(arguments)[name]) else ''
-    force = arguments.force
+    force, begun = arguments.force, folder / PARAMETERS
+    if config.runtime.backend == 'auto' and begun.exists() and not force:
+        # What has been begun with numpy goes on with it, although compiled code may be there now.
+        backend = Config.from_yaml(begun).runtime.backend
+        config = config.replace(**{'runtime.backend': backend})
+    else:
+        config = options.spare_compiling(config, count_clouds(items), quiet=arguments.quiet)
     with closing(Record(folder, to_yaml(config, title))) as record:
         left = record.find_left(items, force=force)
         if len(left) < len(items):
@@ -167,9 +174,6 @@ def _segment_into(
                 # A bag takes long: each is a block by itself, and kept once it is finished.
                 group = attrgetter('path') if arguments.more else None
                 blocks, found = cut(left, group, runner.n_workers), Outcome.of([])
-                config = options.spare_compiling(
-                    config, count_clouds(items), quiet=arguments.quiet
-                )
                 compute = partial(segment_block, folder, config)
                 outcomes = runner.map(compute, blocks, count_clouds)
                 for block, outcome in zip(blocks, outcomes, strict=True):
@@ -226,8 +230,6 @@ def _default_output(source: Path, form: str | None = None) -> Path:
     if named.is_dir():
         return named.with_name(f'{named.name}_ground')
     suffix = '' if named.suffix in ('.bag', '.bin') else named.suffix
-    if suffix in SUFFIXES and suffix not in WRITABLE:
-        suffix = '.npz'
     if form in FORMATS:
         suffix = '' if named.suffix in BAG_SUFFIXES else f'.{form}'
     return named.with_name(f'{named.stem}_ground{suffix}')

@@ -26,10 +26,9 @@ from gp_ground_seg.data.clouds import Cloud
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_fields, read_xyz
 from gp_ground_seg.data.scan_layout import KITTI_COLUMNS
 
-# Where the scans of a data set are, in a folder of one of its drives, and these in its root.
-_SCAN_FOLDERS = ('.', 'velodyne', 'velodyne_points/data', 'samples/LIDAR_TOP')
-_DRIVES = ('sequences/*/velodyne', 'data_3d_raw/*/velodyne_points', '*/velodyne_points')
-
+# Where the scans are in a sequence of SemanticKITTI or a root of nuScenes, and those sequences.
+_SCAN_FOLDERS = ('.', 'velodyne', 'samples/LIDAR_TOP')
+_DRIVES = 'sequences/*/velodyne'
 _OUTPUT = re.compile(r'_ground(_ground|_obstacles|_surface)?$')
 """What `segment` adds to the name of a scan whose output goes beside it."""
 _LOGGER = logging.getLogger('gp_ground_seg')
@@ -107,7 +106,7 @@ def list_inputs(
     ----------
     source : str or Path
         A file of a known format; a folder of such files, of one or several formats; a sequence
-        of SemanticKITTI, a raw drive of KITTI or KITTI-360; a bag.
+        of SemanticKITTI; the root of nuScenes; a bag.
     columns : int
         Numbers of a point in ``.bin`` files. ``.pcd.bin`` of nuScenes has five, and is recognised
         by its name.
@@ -160,7 +159,7 @@ def _find_files(source: Path) -> Sequence[Path]:
         folder = source / name
         if files := sorted(filter(_is_scan, folder.glob('*'))):
             return _without_output(files)
-    drives = sorted({str(path.parent) for pattern in _DRIVES for path in source.glob(pattern)})
+    drives = sorted(str(path.parent) for path in source.glob(_DRIVES))
     hint = ''
     if drives:
         names = ', '.join(Path(drive).name for drive in drives)
