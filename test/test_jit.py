@@ -239,7 +239,7 @@ def test_few_scans_do_not_wait_for_the_compiler(tmp_path):
         )  # fmt: skip
         said = process.communicate(timeout=60)[1]
         assert process.returncode == 0, said
-        assert said.count('segmenting with numpy; to have compiled code, run') == n_notes
+        assert said.count('segmented with numpy; to have compiled code, run') == n_notes
         assert 'compiling' not in said
         labels.append((tmp_path / 'a.label').read_bytes())
     assert len(set(labels)) == 1

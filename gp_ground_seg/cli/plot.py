@@ -104,7 +104,8 @@ def run(arguments: argparse.Namespace) -> int:
     truth = None
     if arguments.labels is not None:
         truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
-    result = GroundSegmenter(options.spare_compiling(config, 1)).segment(points)
+    used = options.spare_compiling(config, 1)
+    result = GroundSegmenter(used).segment(points)
     if arguments.picture == 'scan':
         camera = arguments.camera
         said = plot_scan_view(points, result.label, path, title, camera, truth=truth)
@@ -113,6 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
         plot_segment(result, config, points, segments, path, truth, title)
         said = '; '.join(_segment_counts(result, segment) for segment in segments)
     print(f'{said}, written to {shown(path)}')
+    options.note_spared(config, used)
     return 0
 
 

@@ -141,9 +141,11 @@ def _segment_to(target: Path, item: Item, arguments: argparse.Namespace, config:
         check_writable(target, force=arguments.force)
     options.note_leftovers(target, quiet=arguments.quiet)
     bar = options.progress('segment', quiet=arguments.quiet)
-    config = options.spare_compiling(config, item.n_clouds, quiet=arguments.quiet)
-    results = item.write(GroundSegmenter(config), target.parent)
+    used = options.spare_compiling(config, item.n_clouds)
+    results = item.write(GroundSegmenter(used), target.parent)
     _print_summary(Outcome.of(bar(results, total=item.n_clouds)), target)
+    if not arguments.quiet:
+        options.note_spared(config, used)
 
 
 def _segment_into(
@@ -160,11 +162,10 @@ def _segment_into(
     force, begun = arguments.force, folder / PARAMETERS
     if config.runtime.backend == 'auto' and begun.exists() and not force:
         # What has been begun with numpy goes on with it, although compiled code may be there now.
-        backend = Config.from_yaml(begun).runtime.backend
-        config = config.replace(**{'runtime.backend': backend})
+        used = config.replace(**{'runtime.backend': Config.from_yaml(begun).runtime.backend})
     else:
-        config = options.spare_compiling(config, count_clouds(items), quiet=arguments.quiet)
-    with closing(Record(folder, to_yaml(config, title))) as record:
+        used = options.spare_compiling(config, count_clouds(items))
+    with closing(Record(folder, to_yaml(used, title))) as record:
         left = record.find_left(items, force=force)
         if len(left) < len(items):
             print(f'{len(items) - len(left)} of {len(items)} were finished before')
@@ -174,12 +175,14 @@ def _segment_into(
                 # A bag takes long: each is a block by itself, and kept once it is finished.
                 group = attrgetter('path') if arguments.more else None
                 blocks, found = cut(left, group, runner.n_workers), Outcome.of([])
-                compute = partial(segment_block, folder, config)
+                compute = partial(segment_block, folder, used)
                 outcomes = runner.map(compute, blocks, count_clouds)
                 for block, outcome in zip(blocks, outcomes, strict=True):
                     record.add(block)
                     found = found.joined(outcome)
             _print_summary(found, folder, runner.n_workers)
+            if not arguments.quiet:
+                options.note_spared(config, used)
         sweep(folder, items)
 
 

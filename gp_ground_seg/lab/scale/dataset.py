@@ -6,6 +6,7 @@ import fcntl
 import json
 import logging
 import os
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -127,6 +128,8 @@ class Record:
         self._folder, self._parameters = folder, parameters
         self._file: IO[bytes] | None = None
         self._inputs: dict[Path, tuple[int, str]] = {}
+        self._to_write: list[str] = []
+        self._is_new = False
 
     def find_left(self, items: Sequence[Item], *, force: bool) -> list[Item]:
         """Lock the folder, and return the items that are not finished; all with `force`.
@@ -203,6 +206,7 @@ class Record:
 
     def begin(self, items: Sequence[Item], *, force: bool) -> None:
         """Note the files of the items: what follows may write them. With `force` begin anew."""
+        self._is_new = not self._folder.exists()
         self._folder.mkdir(parents=True, exist_ok=True)
         if self._file is None:
             self._lock()
@@ -211,7 +215,8 @@ class Record:
         known = b'' if force else read_bytes(self._folder / RECORD, _MAX_RECORD_BYTES)
         self._file.truncate(known.rfind(b'\n') + 1)
         write_file(self._folder / PARAMETERS, self._parameters.encode())
-        self._append({'to_write': [name for item in items for name in item.names]})
+        self._to_write = [name for item in items for name in item.names]
+        self._append({'to_write': self._to_write})
 
     def add(self, items: Iterable[Item]) -> None:
         """Note that the files of the items are written."""
@@ -226,9 +231,11 @@ class Record:
         self._file.write(json.dumps(entry).encode() + b'\n')
 
     def close(self) -> None:
-        """Free the lock."""
+        """Free the lock; a folder that was made for files, of which none is written, goes."""
         if self._file is not None:
             self._file.close()
+        if self._is_new and not any((self._folder / name).exists() for name in self._to_write):
+            shutil.rmtree(self._folder, ignore_errors=True)
 
 
 def sweep(folder: Path, items: Iterable[Item]) -> None:
