@@ -6,8 +6,8 @@ import fcntl
 import json
 import logging
 import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -235,7 +235,11 @@ class Record:
         if self._file is not None:
             self._file.close()
         if self._is_new and not any((self._folder / name).exists() for name in self._to_write):
-            shutil.rmtree(self._folder, ignore_errors=True)
+            for name in RECORD, PARAMETERS:
+                (self._folder / name).unlink(missing_ok=True)
+            for folder in [*sorted(self._folder.rglob('*'), reverse=True), self._folder]:
+                with suppress(OSError):  # something else is in it
+                    folder.rmdir()
 
 
 def sweep(folder: Path, items: Iterable[Item]) -> None:
