@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.core.pipeline.points import objection_to_ranges
+from gp_ground_seg.core.pipeline.points import finite_points, objection_to_ranges
 from gp_ground_seg.data.files import MAX_SCAN_BYTES, read_bytes
 
 KITTI_COLUMNS = 4
@@ -21,6 +21,7 @@ _OTHER_COLUMNS = range(MIN_COLUMNS, 9)  # that are looked at in doubt
 
 _MIN_POINTS = 100  # fewer are not judged
 _N_JUDGED = 10_000  # points looked at in a larger scan
+_N_DISTANCES = 2_000  # of successive points, that are looked at
 _SMALLEST = 1e-6  # of a coordinate that can be measured [m]
 _MAX_UNMEASURABLE = 0.4  # share of them; z may be zero in a whole scan
 # Three quarters of the points of the other number are that much nearer to the next one than the
@@ -68,7 +69,7 @@ def find_columns(numbers: npt.NDArray[np.float32], columns: int) -> int:
 def _distance(numbers: npt.NDArray[np.float32], columns: int, share: float) -> float:
     """Distance [m] that this share of successive finite points is not beyond; or infinity."""
     xyz = numbers.reshape(-1, columns)[:, :3]
-    first = np.arange(0, len(xyz) - 1, 1 + len(xyz) // _N_JUDGED)
+    first = np.arange(0, len(xyz) - 1, 1 + len(xyz) // _N_DISTANCES)
     with np.errstate(all='ignore'):
         distance = np.linalg.norm(xyz[first + 1].astype(np.float64) - xyz[first], axis=1)
     distance = distance[np.isfinite(distance)]
@@ -94,7 +95,12 @@ def check_scan(place: str | Path, xyz: npt.NDArray[np.floating]) -> None:
 
 def find_objection(xyz: npt.NDArray[np.floating]) -> str:
     """Return why points (N, 3) can be no scan, or ''."""
-    finite = xyz[np.isfinite(xyz).all(axis=1)]
+    # All are looked at where some of them raise a doubt.
+    return _objection(xyz[:: 1 + len(xyz) // _N_JUDGED]) and _objection(xyz)
+
+
+def _objection(xyz: npt.NDArray[np.floating]) -> str:
+    finite = xyz[finite_points(xyz)]
     if not len(finite):
         return f'none of {len(xyz)} points is finite' if len(xyz) else 'no points in it'
     if problem := objection_to_ranges(finite):
@@ -105,7 +111,5 @@ def find_objection(xyz: npt.NDArray[np.floating]) -> str:
     returned = finite[(finite != 0.0).any(axis=1)]
     if not len(returned):
         return 'all points are at the origin'
-    share = float(np.mean(np.abs(returned[:: 1 + len(returned) // _N_JUDGED]) < _SMALLEST))
-    if share > _MAX_UNMEASURABLE:
-        return f'{share:.0%} of the coordinates are below 1e-6 m'
-    return ''
+    share = float(np.mean(np.abs(returned) < _SMALLEST))
+    return f'{share:.0%} of the coordinates are below 1e-6 m' if share > _MAX_UNMEASURABLE else ''

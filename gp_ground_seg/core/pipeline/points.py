@@ -53,8 +53,8 @@ def take_points(points: npt.ArrayLike) -> PointArray:
 @np.errstate(all='ignore')
 def objection_to_ranges(xyz: PointArray) -> str:
     """Return what is wrong where points (N, 3) are farther away than a sensor measures, or ''."""
-    is_beyond = np.abs(xyz).max(axis=1, initial=0.0) > FARTHEST
-    is_beyond &= np.isfinite(xyz).all(axis=1)
+    x, y, z = np.abs(xyz).T
+    is_beyond = finite_points(xyz) & ((x > FARTHEST) | (y > FARTHEST) | (z > FARTHEST))
     if is_beyond.sum() <= _MAX_BEYOND * len(xyz):
         return ''
     middle = ', '.join(f'{value:.1f}' for value in np.median(xyz[is_beyond], axis=0))
