@@ -7,16 +7,15 @@ KITTI ?= $(abspath $(wildcard ../shared/kitti))
 # Empty, the variable would be a path to the tests.
 WITH_KITTI := $(if $(KITTI),GP_GROUND_SEG_KITTI=$(KITTI))
 
-.PHONY: help demo test test-all chromium browser-test torture bench bench-docs figures docs node-bench colcon lint format generate clean
+.PHONY: help demo test test-all chromium browser-test torture bench figures docs node-bench colcon lint format generate clean
 
 help:
-	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
+	@echo 'make demo      a synthetic drive through the node: score, latency and a picture'
 	@echo 'make test      the tests, but those marked slow (KITTI=PATH adds labelled frames)'
 	@echo 'make test-all  all tests'
 	@echo 'make browser-test  the page of tune in a headless Chromium, which root gets by apt'
 	@echo 'make torture   adversarial clouds, files and uses (TORTURE_SCALE=100 for a night)'
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
-	@echo 'make bench-docs  the same, into docs/performance.json and its picture'
 	@echo 'make figures   every table and picture of README and docs anew (needs KITTI=PATH; ONLY=word for some)'
 	@echo 'make docs      the documentation as HTML, in build/docs'
 	@echo 'make node-bench  latency and losses of the node over DDS'
@@ -45,7 +44,7 @@ $(VENV)/.docs: setup.py $(VENV)/.dev
 	@touch $@
 
 demo: $(VENV)/.ros
-	$(BIN)/gp-ground-seg demo --force $(if $(KITTI_ROOT),--kitti $(KITTI_ROOT))
+	$(BIN)/gp-ground-seg demo --force
 
 # A test that hangs fails after so many seconds, with a traceback; the slowest runs `make test`.
 test: $(VENV)/.dev
@@ -66,13 +65,7 @@ torture: $(VENV)/.dev
 	$(BIN)/python test/torture.py
 
 bench: $(VENV)/.dev
-	$(BIN)/gp-ground-seg bench $(KITTI) --passes 3 --numpy
-
-bench-docs: $(VENV)/.dev
-	$(BIN)/gp-ground-seg bench $(KITTI) --passes 3 --numpy --force \
-		--json docs/performance.json
-	$(BIN)/python docs/stages.py
-	$(BIN)/python docs/generate.py
+	$(BIN)/gp-ground-seg experiment speed $(KITTI)
 
 figures: $(VENV)/.dev
 	$(BIN)/python docs/figures.py $(KITTI) $(ONLY)

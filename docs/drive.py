@@ -21,11 +21,11 @@ WIDTH, N_COLOURS = 720, 24
 
 def main(path: str) -> int:
     """Segment and draw each scan; write one file of all."""
-    drive, pictures, n_points, n_ground = simulated_drive(N_SCANS), [], 0, 0
+    pictures, n_points, n_ground = [], 0, 0
     segmenter = GroundSegmenter()
     with tempfile.TemporaryDirectory() as folder:
         still = Path(folder) / 'scan.png'
-        for points, _, _ in drive.scans:
+        for points, _, _ in simulated_drive(N_SCANS):
             label = segmenter.segment(points).label
             n_points, n_ground = n_points + len(label), n_ground + np.sum(label == Label.GROUND)
             plot_scan_view(points, label, still)
@@ -35,7 +35,7 @@ def main(path: str) -> int:
     first, *rest = pictures
     first.save(path, save_all=True, append_images=rest, duration=PERIOD, loop=0)
     said = f'{N_SCANS} scans: {in_thousands(n_points)} points, {in_thousands(n_ground)} ground'
-    print(f'{drive.name}, {said}, written to {path}')
+    print(f'Simulated street, {said}, written to {path}')
     return 0
 
 

@@ -1,6 +1,5 @@
 """Rewrite config/*.yaml, the tables of parameters, and README's scores: `make generate`."""
 
-import json
 from pathlib import Path
 
 from gp_ground_seg.core.errors import DataError
@@ -87,14 +86,16 @@ ROBOT = {
 }
 """Rows of low things and false cells, by the column of what is counted."""
 TIMES = {
-    'learning, 1 thread': 'learning',
-    'theta fixed, 1 thread': 'no learning',
+    'learning': 'learning',
+    'theta fixed': 'no learning',
     'learning, numpy': 'learning, without numba',
 }
+"""Rows of times, by the method."""
+PERFORMANCE = 'docs/performance.md'
 
 
 def to_scores_table() -> str:
-    """Write a table of the scores of docs/accuracy.md and the times of docs/performance.json."""
+    """Write a table of the scores of docs/accuracy.md and the times of docs/performance.md."""
     page = 'docs/accuracy.md'
     rows = [['Measure', 'gp_ground_seg', 'Patchwork++', 'Difference (95 % interval)'], ['---'] * 4]
     gains = {points: cells for points, *cells in rows_below(page, 'IoU minus that of ')}
@@ -114,17 +115,17 @@ def to_scores_table() -> str:
         number, ours, peer = pooled[k : k + 3]
         cells = ('-' if share == '-' else f'{share} %' for share in (ours, peer))
         rows.append([f'{title}, of {number}', *cells, ''])
-    record = json.loads((ROOT / 'docs' / 'performance.json').read_text(encoding='utf-8'))
-    cases = {case['name']: case for case in record['cases']}
-    baseline = f'{record["baseline_ms"]["median"]:.1f} ms'
+    times = {method: cells for method, *cells in rows_below(PERFORMANCE, 'Time per frame')}
+    baseline = f'{float(times["Patchwork++"][0]):.1f} ms'
     for name, title in TIMES.items():
-        time, ratio = cases[name]['ms']['median'], cases[name]['ratio']['median']
+        time, _, ratio, _ = map(float, times[name])
         cells = f'time per frame, {title}', f'{time:.3g} ms', baseline, f'{ratio:#.2g} times'
         rows.append([*cells])
     table = ''.join(f'| {" | ".join(row)} |\n' for row in rows)
-    machine = record['environment']
-    cpu = f'{machine["cpu"]}, {machine["n_cores"]} cores'
-    notes = f'Times are medians ({cpu}); the factor is the median of the ratios frame by frame.'
+    notes = (
+        f'Times are medians on the machine of [{PERFORMANCE}]({PERFORMANCE}); the factor is the '
+        'median of the ratios frame by frame.'
+    )
     return f'{table}\n{notes}\n'
 
 

@@ -11,12 +11,17 @@ import itertools
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from gp_ground_seg.cli.bags import scan_cloud
-from gp_ground_seg.cli.bench import load_frames
-from gp_ground_seg.cli.demo import FRAME_ID, simulated_drive
+from gp_ground_seg.cli.demo import FRAME_ID, INPUT, OUTPUTS, Link, simulated_drive
 from gp_ground_seg.cli.options import progress
+from gp_ground_seg.data.inputs import list_inputs
+from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, stamp_of, with_header
+from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
 from gp_ground_seg.lab.scoring.report import (
     Column,
     Table,
@@ -24,8 +29,10 @@ from gp_ground_seg.lab.scoring.report import (
     machine_line,
     milliseconds,
 )
-from gp_ground_seg.ros.probe import NodeProcess, Probe, probe_session, rate_result, restamped
+from gp_ground_seg.ros.node_process import NodeProcess, private_session
 
+SILENCE = 2.0
+"""Time without a cloud after which what is still missing is lost [s]."""
 N_SIMULATED = 10
 COUNTS = {'sent': 'n_sent', 'back': 'n_back', 'lost': 'n_lost', 'reported': 'n_dropped'}
 PERCENTILES = {'p50 [ms]': 'p50', 'p95': 'p95', 'p99': 'p99', 'worst': 'worst'}
@@ -49,28 +56,104 @@ def dropped_by_node(session, arrays):
     raise TimeoutError('no diagnostics of the node within 5 s')
 
 
+class Probe:
+    """Sends clouds at a rate, whether or not results come back, and notes when both did."""
+
+    def __init__(self, session):
+        from sensor_msgs.msg import PointCloud2
+
+        from gp_ground_seg.ros.input import cloud_profile
+
+        self._session, self._sent, self._back = session, {}, {}
+        self._publisher = session.node.create_publisher(PointCloud2, INPUT, cloud_profile(10))
+        for topic in OUTPUTS:
+            take = partial(self._take, topic)
+            profile = cloud_profile(50)
+            session.node.create_subscription(PointCloud2, topic, take, profile, raw=True)
+
+    def _take(self, topic, raw, info):
+        back = self._back.setdefault(stamp_of(decode_cloud(raw)), {})
+        back[topic] = info.get('received_timestamp') or time.time_ns()
+
+    def _n_back(self):
+        return sum(len(self._back.get(stamp, ())) == len(OUTPUTS) for stamp in self._sent)
+
+    def send(self, clouds, rate, on_sent):
+        """Send clouds at a rate [Hz]; return counts, and percentiles of the latency [s]."""
+        self._sent.clear()
+        due = time.monotonic()
+        for cloud in clouds:
+            raw = encode_cloud(cloud)
+            while (left := due - time.monotonic()) > 0.0:
+                self._session.spin(left)
+            self._sent[stamp_of(cloud)] = time.time_ns()
+            self._publisher.publish(raw)
+            on_sent()
+            due += 1.0 / rate
+        n_back, last_news = self._n_back(), time.monotonic()
+        while n_back < len(self._sent) and time.monotonic() < last_news + SILENCE:
+            self._session.spin(0.02)
+            if (n := self._n_back()) > n_back:
+                n_back, last_news = n, time.monotonic()
+        return self._result(rate)
+
+    def _result(self, asked):
+        times = {stamp: self._back.get(stamp, {}) for stamp in self._sent}
+        latency = [
+            1e-9 * (max(back.values()) - self._sent[stamp])
+            for stamp, back in times.items()
+            if len(back) == len(OUTPUTS)
+        ]
+        first, *_, last = self._sent.values()
+        percents = np.percentile(latency, [50, 95, 99, 100]) if latency else [np.nan] * 4
+        return {
+            'asked': asked,
+            'sent': (len(self._sent) - 1) / (1e-9 * (last - first)),
+            'n_sent': len(self._sent),
+            'n_back': len(latency),
+            'n_lost': len(self._sent) - len(latency),
+            **dict(zip(('p50', 'p95', 'p99', 'worst'), percents, strict=True)),
+        }
+
+
+def restamped(clouds, start):
+    """Yield clouds over and over, stamped every 0.1 s from the second `start` on."""
+    for k, cloud in enumerate(itertools.cycle(clouds)):
+        yield with_header(cloud, (start + k // 10, k % 10 * 10**8))
+
+
 def measure(clouds, rates, n_frames, ros_args=()):
-    """Results at each rate, as `rate_result` has them, with what the node says it dropped."""
+    """Results at each rate, with what the node says it dropped."""
     from diagnostic_msgs.msg import DiagnosticArray
 
     stamped = restamped(clouds, 1_700_000_000)
     with (
-        probe_session('node_bench') as (session, own),
+        private_session('node_bench') as (session, own),
         tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
         NodeProcess(Path(folder, 'log'), [*own, *ros_args]) as node,
     ):
         arrays, results = [], []
         session.node.create_subscription(DiagnosticArray, '/diagnostics', arrays.append, 10)
-        probe = Probe(session, lambda *_: None)
-        probe.connect(node)
+        Link(session, node).connect(clouds[0])
+        probe = Probe(session)
         for rate in rates:
             before = dropped_by_node(session, arrays)
             with progress(f'{rate:g} Hz')(total=n_frames) as bar:
-                trips = probe.send(itertools.islice(stamped, n_frames), rate, bar.update)
+                found = probe.send(itertools.islice(stamped, n_frames), rate, bar.update)
             n_dropped = dropped_by_node(session, arrays) - before
-            results.append({**rate_result(rate, trips), 'n_dropped': n_dropped})
+            results.append({**found, 'n_dropped': n_dropped})
         node.check()
     return results
+
+
+def read_scans(path, n_wanted, topic):
+    """Points of the first scans of a KITTI folder, or of what `segment` takes."""
+    if topic is None and any(path.glob('sequences/*/velodyne')):
+        frames = labelled_frames(path)[:n_wanted]
+        return [read_points(frame.points_path, frame.columns) for frame in frames]
+    inputs = list_inputs(path, 4, topic)
+    clouds = [item.read().xyz for item in itertools.islice(inputs, n_wanted)]
+    return [np.column_stack([xyz, np.ones(len(xyz))]).astype(np.float32) for xyz in clouds]
 
 
 def main():
@@ -86,10 +169,9 @@ def main():
     parser.add_argument('--frames', type=int, default=600, help='clouds sent at each rate')
     given = parser.parse_args(words)
     if given.data:
-        frames = load_frames(Path(given.data), given.clouds, given.topic)
-        scans = [frame.points for frame in frames]
+        scans = read_scans(Path(given.data), given.clouds, given.topic)
     else:
-        scans = [points for points, _, _ in simulated_drive(N_SIMULATED).scans]
+        scans = [points for points, _, _ in simulated_drive(N_SIMULATED)]
     clouds = [scan_cloud(points, 0, FRAME_ID) for points in scans]
     rates = measure(clouds, given.rates, given.frames, ros_args)
     n_points = sum(map(len, scans)) / len(scans)

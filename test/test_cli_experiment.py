@@ -66,6 +66,7 @@ CASES = {
         ['--sensors', 'vlp-16', '--scenes', 'hidden_climb,hedge', '--seeds', '1'], 'vehicles', 4,
     ),
     'table1': (['ROOT'], 'errors', 3),
+    'speed': (['ROOT', '--frame-step', '3', *SMALL], 'times', 2 * 5 * 3),
     'table1 --preset': (['paper', 'ROOT', '--set', 'learning.max_evaluations=4'], 'errors', 3),
 }  # fmt: skip
 
@@ -175,7 +176,7 @@ def test_usage_errors(words, message, capsys):
 def test_commands_of_the_docs_are_accepted():
     """Those above the tables of the docs, and those in their text."""
     names = set()
-    for page in ('experiments', 'accuracy', 'algorithm'):
+    for page in ('experiments', 'accuracy', 'algorithm', 'performance'):
         text = (REPOSITORY / 'docs' / f'{page}.md').read_text(encoding='utf-8')
         for words in re.findall(
             r'`gp-ground-seg ((?:experiment|evaluate|plot|pose) [^`]*?)`', text

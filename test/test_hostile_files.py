@@ -62,8 +62,7 @@ segment NAME
 segment NAME -o out
 plot scan NAME -o a.png
 evaluate NAME
-bench NAME
-bench --from NAME
+experiment speed NAME
 play NAME
 config dump --config NAME
 kitti-to-bag NAME --sequence 00 out

@@ -82,7 +82,6 @@ def test_every_figure_is_as_it_was_written():
 
 
 NO_FIGURES = {
-    'images/performance.png',  # by `make bench-docs`
     'images/street.png',  # a figure of README.md
     'images/tune.png',  # a screenshot, of what test_browser.py looks at
 }
@@ -138,7 +137,7 @@ def test_the_picture_of_the_demo_is_that_of_the_demo(tmp_path):
     (figure,) = (figure for figure in FIGURES if figure.command == 'demo')
     number = int(re.search(r'\(scan (\d+): ', figure.body)[1])
     *_, (points, semantic, _) = (
-        scan for _, scan in zip(range(number), demo.simulated_drive(30).scans, strict=False)
+        scan for _, scan in zip(range(number), demo.simulated_drive(30), strict=False)
     )
     label = GroundSegmenter().segment(points).label
     truth = GROUNDGRID.truth(semantic, points[:, 2])
@@ -302,15 +301,3 @@ def test_samples_that_differ():
 )
 def test_cells(shown, found, is_same):
     assert same(shown, found) is is_same
-
-
-def test_bars_of_the_stages_are_as_long_as_their_times(tmp_path, monkeypatch):
-    stages, drawn = load_script('docs/stages.py'), []
-    monkeypatch.setattr(stages, 'save', lambda figure, _path: drawn.extend(figure.axes))
-    cases = {f'case {k}': {'first': 10.0 * k, 'second': 30.0} for k in range(1, 5)}
-    stages.plot_stage_bars(cases, tmp_path / 'bars.png', 'title', baseline=('other', 80.0))
-    (axes,) = drawn
-    first, second = axes.containers
-    assert [bar.get_width() for bar in first] == [10.0, 20.0, 30.0, 40.0]
-    assert [(bar.get_x(), bar.get_width()) for bar in second][:2] == [(10.0, 30.0), (20.0, 30.0)]
-    assert [list(line.get_xdata()) for line in axes.lines] == [[80.0, 80.0]]

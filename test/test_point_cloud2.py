@@ -175,7 +175,6 @@ def test_what_is_not_needed_is_not_checked():
     empty = Layout(0, 0, [], False, 0, 0, b'')
     assert read_xyz(empty).shape == (0, 3)
     assert len(point_cloud2.select_rows(empty, np.zeros(0, dtype=bool))) == 0
-    # `demo` finds the node with such a cloud.
     cloud = point_cloud2.cloud_from_columns((0, 0), 'lidar', {})
     assert point_cloud2.select_points(cloud, np.zeros(0, dtype=bool)).width == 0
     layout = kitti_layout(row_step=0)

@@ -11,8 +11,13 @@ from gp_ground_seg import Config
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.frame import OUTSIDE
-from gp_ground_seg.core.parameters.config import GridConfig
-from gp_ground_seg.core.pipeline.polar_grid import azimuth_key, bin_edges, grid_geometry
+from gp_ground_seg.core.parameters.config import NARROWEST_BIN, GridConfig
+from gp_ground_seg.core.pipeline.polar_grid import (
+    LARGEST_TABLE,
+    azimuth_key,
+    bin_edges,
+    grid_geometry,
+)
 
 PLACE = st.floats(-120, 120)
 
@@ -36,7 +41,7 @@ def assert_same_scan(found, expected):
 
 
 @settings(max_examples=fewer(100, 10))
-@given(PLACE, PLACE, st.integers(4, 50), st.integers(4, 50), st.floats(1.0, 3.0))
+@given(PLACE, PLACE, st.integers(4, 50), st.integers(4, 50), st.floats(1.0, 2.9))
 def test_cell_of_a_point(backend, x, y, n_segments, n_bins, growth):
     config = config_of(n_segments=n_segments, n_bins=n_bins, bin_growth=growth)
     grid = backend.build_grid(np.array([[x, y, 0.0]]), config).grid
@@ -79,7 +84,7 @@ def test_both_sides_of_the_negative_x_axis(backend):
 )
 def test_cells_tiles_and_candidates_are_the_reference(backend, seed, n, dtype):
     rng, xyz = np.random.default_rng(seed), hilly_scan(n, seed=seed)
-    growth, n_bins = float(rng.uniform(1.0, 3.0)), int(rng.integers(4, 61))
+    growth, n_bins = float(rng.uniform(1.0, 2.4)), int(rng.integers(4, 61))
     xyz[::7] = np.round(xyz[::7])  # equal heights, points on edges and axes
     xyz[::50, seed % 3] = np.nan
     # Infinite, or far away near the limit of single precision.
@@ -100,13 +105,17 @@ def test_cells_tiles_and_candidates_are_the_reference(backend, seed, n, dtype):
 
 
 def test_the_narrowest_bins_that_are_accepted_do_not_fill_the_memory():
-    config = config_of(n_bins=1024, bin_growth=1.97, n_segments=fewer(2048, 200))
-    geometry = grid_geometry(config.grid, 0.5, np.dtype(np.float64))
-    assert len(geometry.ranges.bins) < 40_000
-    assert geometry.ranges.is_coarse
-    xyz = hilly_scan(4000, seed=3)
-    found = NumbaBackend().build_grid(xyz, config)
-    assert_same_scan(found, NumpyBackend().build_grid(xyz, config))
+    config = config_of(
+        2.0, n_bins=1024, bin_growth=1.892, r_max=500.0, n_segments=fewer(2048, 200)
+    )
+    for dtype in (np.float32, np.float64):
+        geometry = grid_geometry(config.grid, 2.0, np.dtype(dtype))
+        assert np.diff(geometry.edges).min() < 1.05 * NARROWEST_BIN
+        assert len(geometry.ranges.bins) <= LARGEST_TABLE + 2
+        xyz = hilly_scan(4000, seed=3).astype(dtype)
+        found = NumbaBackend().build_grid(xyz, config)
+        assert_same_scan(found, NumpyBackend().build_grid(xyz, config))
+        assert_same_scan(found, Reference().build_grid(xyz, config))
 
 
 def test_nothing_of_one_scan_shows_in_the_next():

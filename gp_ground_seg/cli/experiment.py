@@ -12,6 +12,7 @@ from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.lab.experiments import ablation
 from gp_ground_seg.lab.experiments.scenes import CROWDED, score_objects, score_scenes
+from gp_ground_seg.lab.experiments.speed import measure_speed
 from gp_ground_seg.lab.experiments.table1 import table1
 from gp_ground_seg.lab.experiments.variants import simulated_frames
 from gp_ground_seg.lab.scoring.report import Report, describe_environment, machine_line, written
@@ -86,6 +87,7 @@ EXPERIMENTS = {
     ),
     'objects': Experiment(score_objects, [*SENSORS], CROWDED, n_seeds=2, labelled=False),
     'table1': Experiment(table1, is_timed=True),
+    'speed': Experiment(measure_speed, is_timed=True),
 }
 """Experiments by name. A new one is a row here and its function."""
 

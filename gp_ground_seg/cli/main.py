@@ -42,7 +42,6 @@ COMMANDS = {
     'plot': ('plot', 'draw a scan in perspective, or a segment of it from the side'),
     'tune': ('tune', 'set parameters by sliders, and see the labels change'),
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
-    'bench': ('bench', 'time the segmentation by stage, beside Patchwork++'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
 }
 GROUPS = {'robot': 'node', 'files': 'segment', 'laboratory': 'evaluate'}

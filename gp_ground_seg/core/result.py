@@ -67,15 +67,6 @@ class cached_property(Generic[_Value]):  # noqa: N801 - a decorator
 
 
 @dataclass(frozen=True)
-class Fitting:
-    """Facts for `FitReport` that are not in the other results."""
-
-    mode: str  # ``learning.mode`` of the frame
-    learned: Learned | None  # outcome of the learning; None where there was none
-    backend: str  # ``numba`` or ``numpy``
-
-
-@dataclass(frozen=True)
 class FitReport:
     """Outcome of the learning and of the inlier growth.
 
@@ -120,12 +111,12 @@ class FitReport:
     @classmethod
     def of(cls, frame: Segmentation) -> FitReport:
         """Sum up one frame."""
-        learned = frame.fitting.learned
+        learned = frame.learned
         values, names = np.exp(frame.theta), theta_names(len(frame.theta))
         at_bound = learned.at_bound if learned else np.zeros(len(names), np.bool_)
         n_inliers = int(frame.surface.inlier.sum())
         return cls(
-            mode=frame.fitting.mode,
+            mode='every_frame' if learned else 'fixed',
             status=learned.status if learned else 'kept',
             n_evaluations=learned.n_evaluations if learned else 0,
             objective=learned.objective / n_inliers if learned and n_inliers else float('nan'),
@@ -136,7 +127,7 @@ class FitReport:
             n_inliers=n_inliers,
             n_lines=len(frame.lines.slope),
             n_pseudo_inputs=len(frame.pseudo.r_bar),
-            backend=frame.fitting.backend,
+            backend=frame.backend,
         )
 
 
@@ -153,8 +144,10 @@ class Segmentation:
         `margin` are taken from it.
     timings : dict of str to float
         Seconds per stage, and ``total``.
-    fitting : Fitting
-        How it was fitted; `fit` sums it up.
+    learned : Learned or None
+        Outcome of the learning, None with ``learning.mode = fixed``; `fit` sums it up.
+    backend : str
+        ``numba`` or ``numpy``.
     grid, frame, surface
         Intermediate results, for plots and diagnostics; in the level frame. `surface` is the
         process's own, which the labels follow from; `corrected` is what users are given.
@@ -179,7 +172,8 @@ class Segmentation:
 
     labelled: Labelled
     timings: dict[str, float]
-    fitting: Fitting
+    learned: Learned | None
+    backend: str
     grid: PolarGrid
     frame: Frame
     surface: GroundSurface

@@ -33,7 +33,7 @@ from gp_ground_seg.core.pipeline.sensor_pose import (
     with_fallback,
 )
 from gp_ground_seg.core.pipeline.tilt import rotate_sample
-from gp_ground_seg.core.result import Fitting, Segmentation
+from gp_ground_seg.core.result import Segmentation
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 
@@ -154,7 +154,8 @@ class GroundSegmenter:
         return Segmentation(
             labelled=labelled,
             timings=timer.seconds,
-            fitting=Fitting(config.learning.mode, learned, backend.name),
+            learned=learned,
+            backend=backend.name,
             grid=scan.grid,
             frame=frame,
             surface=surface,

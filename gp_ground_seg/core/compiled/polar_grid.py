@@ -176,17 +176,6 @@ def _look_up(
         n = ranges.bins[k] + (one if r[i] >= ranges.ends[k] else zero)
         m = azimuths.bins[q] + (one if key[i] >= azimuths.ends[q] else zero)
         cell[i] = m * n_bins + n if cell[i] == 0 else cell[i]
-    if not ranges.is_coarse and not azimuths.is_coarse:
-        return
-    for i in range(len(cell)):
-        if cell[i] < 0:
-            continue
-        m, n = cell[i] // n_bins, cell[i] % n_bins
-        while r[i] >= ranges.edges[np.uintp(n + 1)]:
-            n += one
-        while key[i] >= azimuths.edges[np.uintp(m + 1)]:
-            m += one
-        cell[i] = m * n_bins + n
 
 
 @jit()

@@ -294,8 +294,8 @@ _ASCENDING = (
     ('output.min_height', 'output.max_height'),
 )
 """Pairs of which the first must be below the second."""
-NARROWEST_BIN = 1e-4
-"""Least width of a bin [m]: above the resolution of ranges in single precision."""
+NARROWEST_BIN = 1e-3
+"""Least width of a bin [m]: no sensor measures ranges as finely, single precision does."""
 MAX_TABLES = 2e9
 """Most memory that the tables of tiles and cells may take [bytes]."""
 

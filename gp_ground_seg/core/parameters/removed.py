@@ -25,7 +25,14 @@ REMOVED: dict[str, str] = {
     f'{PROGRAM} config diff': (
         f'use diff on two files, each written by {PROGRAM} config dump --config FILE'
     ),
-    f'{PROGRAM} bench --threads': 'leave it out: a scan takes one thread',
+    f'{PROGRAM} bench': (
+        f'use {PROGRAM} experiment speed ROOT; for the time on scans without labels, '
+        f'{PROGRAM} evaluate INPUT --against NAME'
+    ),
+    f'{PROGRAM} demo --kitti': (
+        f'use {PROGRAM} kitti-to-bag, node and play (docs/tutorial_kitti.md)'
+    ),
+    f'{PROGRAM} demo --rate': f'use {PROGRAM} play --rate on what the demo has written',
     f'{PROGRAM} experiment departures': (
         f'use {PROGRAM} evaluate ROOT --set NAME=VALUE --against default'
     ),

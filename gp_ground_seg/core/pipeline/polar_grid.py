@@ -27,8 +27,8 @@ from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, GridConfig
 from gp_ground_seg.core.pipeline.points import copy_points, finite_points, points_in
 
-LARGEST_TABLE = 2**15
-EARLY = 0.02
+LARGEST_TABLE = 2**20
+EARLY = 0.1
 """Offset of the entries of a table towards smaller values, in entries: more than the error of
 single precision in the largest table."""
 
@@ -114,21 +114,19 @@ class BinLookup(NamedTuple):
         Where that bin ends.
     scale : float
         Entries per unit.
-    is_coarse : bool
-        Whether more than one edge may lie in an entry.
     """
 
     edges: PointArray
     bins: CellArray
     ends: PointArray
     scale: float
-    is_coarse: bool
 
     @classmethod
     def of(cls, edges: FloatArray, fineness: int, dtype: np.dtype[np.floating]) -> BinLookup:
         """Table for values of type `dtype` in the bins between `edges` (n + 1,).
 
-        The narrowest bin has `fineness` entries, as far as `LARGEST_TABLE` allows.
+        The narrowest bin has `fineness` entries, as far as `LARGEST_TABLE` allows: no entry may
+        hold two edges, of bins as narrow as `Config` accepts.
         """
         extent, narrowest = float(edges[-1] - edges[0]), float(np.diff(edges).min())
         scale = min(fineness / narrowest, LARGEST_TABLE / extent)
@@ -136,17 +134,13 @@ class BinLookup(NamedTuple):
         starts = edges[0] + (np.arange(int(extent * scale) + 2) - EARLY) / scale
         bins = np.clip(np.searchsorted(edges, starts, side='right') - 1, 0, len(edges) - 2)
         rounded = np.array([round_up_to(dtype, edge) for edge in edges], dtype=dtype)
-        is_coarse = narrowest * scale < 1.0 + 2.0 * EARLY
-        return cls(rounded, bins.astype(np.int32), rounded[bins + 1], scale, is_coarse)
+        return cls(rounded, bins.astype(np.int32), rounded[bins + 1], scale)
 
     def find(self, values: PointArray) -> CellArray:
         """Bin of each of the values (N,), (N,) int32; they are less than the last edge.
 
         Those below the first edge are in bin 0.
         """
-        if self.is_coarse:
-            found = np.searchsorted(self.edges, values, side='right') - 1
-            return np.maximum(found, 0).astype(np.int32)
         beyond = np.maximum(values - self.edges[0], 0.0)
         entry = (beyond * values.dtype.type(self.scale)).astype(np.int64)
         result: CellArray = self.bins[entry]
