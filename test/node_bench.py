@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from gp_ground_seg.cli.bags import scan_cloud
-from gp_ground_seg.cli.demo import FRAME_ID, INPUT, OUTPUTS, Link, simulated_drive
+from gp_ground_seg.cli.demo import FRAME_ID, simulated_drive
 from gp_ground_seg.cli.options import progress
 from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, stamp_of, with_header
@@ -29,7 +29,7 @@ from gp_ground_seg.lab.scoring.report import (
     machine_line,
     milliseconds,
 )
-from gp_ground_seg.ros.node_process import NodeProcess, private_session
+from gp_ground_seg.ros.node_process import INPUT, OUTPUTS, Link, NodeProcess, private_session
 
 SILENCE = 2.0
 """Time without a cloud after which what is still missing is lost [s]."""

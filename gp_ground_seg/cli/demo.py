@@ -6,7 +6,6 @@ import argparse
 import time
 from collections import Counter
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,6 @@ import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.bags import scan_cloud
-from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.data.atomic_output import staged_files
@@ -26,14 +24,12 @@ from gp_ground_seg.data.point_cloud2 import (
     encode_cloud,
     read_fields,
     read_xyz,
-    stamp_of,
-    with_header,
 )
 from gp_ground_seg.lab.plotting.scan import plot_scan_view
 from gp_ground_seg.lab.plotting.style import new_figure
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_labels, label_ratios
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
-from gp_ground_seg.ros.node_process import NodeProcess, private_session
+from gp_ground_seg.ros.node_process import GROUND, OBSTACLES, Link, NodeProcess, private_session
 from gp_ground_seg.ros.start_stop import needing_ros
 
 if TYPE_CHECKING:
@@ -46,14 +42,10 @@ EPOCH = 1_700_000_000
 """Second at which every drive starts: the same drive gives the same bag."""
 SEED, SPEED = 3, 8.0
 """Of the simulated drive; the second [m/s]."""
-INPUT, OUTPUTS = 'points', {'ground': Label.GROUND, 'obstacles': Label.OBSTACLE}
-"""Topics of the node, and the label of what comes back on each."""
+LABELS = {GROUND: Label.GROUND, OBSTACLES: Label.OBSTACLE}
+"""Label of what comes back on each topic."""
 PERIOD = 0.1
 """Shortest time from one scan to the next [s]."""
-PATIENCE = 60.0
-"""Longest time that a scan may take [s]."""
-START_TIMEOUT = 300.0
-"""Time the node has to start, and to compile on a slow machine [s]."""
 
 DESCRIPTION = f"""\
 Show the node at work without data: simulate a short drive along a street, write it as a bag,
@@ -98,56 +90,6 @@ def simulated_drive(
         yield scan.points, semantic_kitti_labels(scan.kind), scan.time
 
 
-class Link:
-    """Sends clouds to a node, and takes the ground and the obstacles of each."""
-
-    def __init__(self, session: Session, node: NodeProcess) -> None:
-        from sensor_msgs.msg import PointCloud2
-
-        from gp_ground_seg.ros.input import cloud_profile
-
-        self._session, self._node = session, node
-        self._back: dict[tuple[int, int], dict[str, CloudMessage]] = {}
-        profile = cloud_profile(10)
-        self._publisher = session.node.create_publisher(PointCloud2, INPUT, profile)
-        for topic in OUTPUTS:
-            take = partial(self._take, topic)
-            session.node.create_subscription(PointCloud2, topic, take, profile, raw=True)
-
-    def connect(self, cloud: CloudMessage) -> None:
-        """Send a cloud until the node answers, and has the backend that it keeps."""
-        first = with_header(cloud, (1, 0))
-        end = time.monotonic() + START_TIMEOUT
-        while self._ask(first, 0.2) is None or not self._node.is_settled():
-            if time.monotonic() > end:
-                raise GroundSegError(self._silence(START_TIMEOUT))
-
-    def ask(self, cloud: CloudMessage) -> dict[str, CloudMessage]:
-        """Send a cloud; return what the node makes of it, by topic."""
-        if (found := self._ask(cloud, PATIENCE)) is None:
-            raise GroundSegError(self._silence(PATIENCE))
-        return found
-
-    def _ask(self, cloud: CloudMessage, patience: float) -> dict[str, CloudMessage] | None:
-        self._publisher.publish(encode_cloud(cloud))
-        stamp, end = stamp_of(cloud), time.monotonic() + patience
-        while time.monotonic() < end:
-            self._session.spin(0.02)
-            self._node.check()
-            if len(self._back.get(stamp, ())) == len(OUTPUTS):
-                return self._back.pop(stamp)
-        return None
-
-    def _take(self, topic: str, raw: bytes) -> None:
-        cloud = decode_cloud(raw)
-        self._back.setdefault(stamp_of(cloud), {})[topic] = cloud
-
-    def _silence(self, seconds: float) -> str:
-        topics = ' and '.join(OUTPUTS)
-        said = self._node.log_tail()
-        return f'no answer on {topics} within {seconds:g} s; the node said last:\n{said}'
-
-
 class Tally:
     """Sums over scans, and the labels of the last of them."""
 
@@ -160,7 +102,7 @@ class Tally:
         """Add a scan and what came back of it, `latency` [s] later."""
         self.latencies.append(latency)
         self.xyz = np.concatenate([read_xyz(cloud) for cloud in back.values()])
-        parts = [np.full(cloud.width, OUTPUTS[topic]) for topic, cloud in back.items()]
+        parts = [np.full(cloud.width, LABELS[topic]) for topic, cloud in back.items()]
         self.label: Labels = np.concatenate(parts).astype(np.uint8)
         semantic = np.concatenate([read_fields(cloud)['label'] for cloud in back.values()])
         self.truth = GROUNDGRID.truth(semantic, self.xyz[:, 2])

@@ -112,16 +112,15 @@ class FitReport:
     def of(cls, frame: Segmentation) -> FitReport:
         """Sum up one frame."""
         learned = frame.learned
-        values, names = np.exp(frame.theta), theta_names(len(frame.theta))
-        at_bound = learned.at_bound if learned else np.zeros(len(names), np.bool_)
+        values, names = np.exp(learned.theta), theta_names(len(learned.theta))
         n_inliers = int(frame.surface.inlier.sum())
         return cls(
-            mode='every_frame' if learned else 'fixed',
-            status=learned.status if learned else 'kept',
-            n_evaluations=learned.n_evaluations if learned else 0,
-            objective=learned.objective / n_inliers if learned and n_inliers else float('nan'),
+            mode='fixed' if learned.status == 'kept' else 'every_frame',
+            status=learned.status,
+            n_evaluations=learned.n_evaluations,
+            objective=learned.objective / n_inliers if n_inliers else float('nan'),
             theta={name: float(value) for name, value in zip(names, values, strict=True)},
-            at_bound=tuple(n for n, hit in zip(names, at_bound, strict=True) if hit),
+            at_bound=tuple(n for n, hit in zip(names, learned.at_bound, strict=True) if hit),
             n_segments=int(np.isfinite(frame.surface.mean[:, 0]).sum()),
             n_candidates=len(frame.candidates.r),
             n_inliers=n_inliers,
@@ -144,16 +143,13 @@ class Segmentation:
         `margin` are taken from it.
     timings : dict of str to float
         Seconds per stage, and ``total``.
-    learned : Learned or None
-        Outcome of the learning, None with ``learning.mode = fixed``; `fit` sums it up.
+    learned : Learned
+        Outcome of the learning; `fit` sums it up.
     backend : str
         ``numba`` or ``numpy``.
     grid, frame, surface
         Intermediate results, for plots and diagnostics; in the level frame. `surface` is the
         process's own, which the labels follow from; `corrected` is what users are given.
-    theta : (T,) float64
-        Logarithms of the hyper-parameters, named by
-        `gp_ground_seg.core.gp.learning.theta_names`.
     log_length_scale : (M, knots) float64
         Log length-scale at the knots of the surface [log m]; NaN in segments
         without candidates.
@@ -172,18 +168,22 @@ class Segmentation:
 
     labelled: Labelled
     timings: dict[str, float]
-    learned: Learned | None
+    learned: Learned
     backend: str
     grid: PolarGrid
     frame: Frame
     surface: GroundSurface
-    theta: FloatArray
     log_length_scale: FloatArray
     pose: SensorPose
     relief: Relief
     z: PointArray
     slope_std: float
     origin: FloatArray
+
+    @property
+    def theta(self) -> FloatArray:
+        """Logarithms of the hyper-parameters, (T,) float64, named by `theta_names`."""
+        return self.learned.theta
 
     @property
     def candidates(self) -> Candidates:

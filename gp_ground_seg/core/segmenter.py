@@ -20,7 +20,7 @@ import numpy.typing as npt
 from gp_ground_seg.core.backend import Backend, make_backend
 from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_errors
-from gp_ground_seg.core.gp.learning import given_theta
+from gp_ground_seg.core.gp.learning import Learned
 from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config, SensorConfig
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
@@ -119,11 +119,7 @@ class GroundSegmenter:
             return result
 
     def _segment(
-        self,
-        xyz: PointArray,
-        sensor: SensorConfig,
-        timer: StageTimer,
-        fallback: SensorPose | None,
+        self, xyz: PointArray, sensor: SensorConfig, timer: StageTimer, fallback: SensorPose | None
     ) -> Segmentation:
         """Do the stages of a scan, one after the other."""
         backend = self._backend
@@ -142,10 +138,10 @@ class GroundSegmenter:
         frame = Frame(*extracted, scan.grid.edges, -pose.height)
         timer.mark('lines')
         # 5. Observation and latent process: hyper-parameters theta, inliers and surface.
-        learned = backend.learn_frame(frame, config) if config.learning.mode != 'fixed' else None
-        theta = learned.theta if learned else given_theta(config)
+        is_fixed = config.learning.mode == 'fixed'
+        learned = Learned.given(config) if is_fixed else backend.learn_frame(frame, config)
         timer.mark('learning')
-        surface, log_length_scale, _ = backend.estimate_surface(frame, theta, config)
+        surface, log_length_scale, _ = backend.estimate_surface(frame, learned.theta, config)
         timer.mark('surface')
         # 6. Labels: ground up to the tolerance over the surface, or higher where it is rough.
         labelled = backend.label_points(scan, faces, surface, relief, config)
@@ -159,7 +155,6 @@ class GroundSegmenter:
             grid=scan.grid,
             frame=frame,
             surface=surface,
-            theta=theta,
             log_length_scale=log_length_scale,
             pose=pose,
             relief=relief,

@@ -1,20 +1,37 @@
-"""A node in a second process. ROS is imported by what needs it: commands import this without."""
+"""A node in a second process, and clouds sent to it.
+
+ROS is imported by what needs it: commands import this module where there is no ROS.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import secrets
 import subprocess
+import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from gp_ground_seg.core.errors import GroundSegError
+from gp_ground_seg.data.point_cloud2 import (
+    CloudMessage,
+    decode_cloud,
+    encode_cloud,
+    stamp_of,
+    with_header,
+)
 from gp_ground_seg.ros.start_stop import (
     Session,
     child_command,
     large_cloud_transport,
     ros_session,
 )
+
+INPUT, GROUND, OBSTACLES = 'points', 'ground', 'obstacles'  # topics of the node
+OUTPUTS = (GROUND, OBSTACLES)
+PATIENCE = 60.0  # longest time that a cloud may take [s]
+START_TIMEOUT = 300.0  # time the node has to start, and to compile on a slow machine [s]
 
 _RUN = 'from gp_ground_seg.ros.start_stop import run_node; sys.exit(run_node(sys.argv[1:]))'
 
@@ -78,3 +95,53 @@ def private_session(name: str) -> Iterator[tuple[Session, list[str]]]:
     words = ['-r', f'__ns:={namespace}', '-r', '/diagnostics:=diagnostics']
     with large_cloud_transport(), ros_session(name, ['--ros-args', *words]) as session:
         yield session, words
+
+
+class Link:
+    """Sends clouds to a node, and takes the ground and the obstacles of each."""
+
+    def __init__(self, session: Session, node: NodeProcess) -> None:
+        from sensor_msgs.msg import PointCloud2
+
+        from gp_ground_seg.ros.input import cloud_profile
+
+        self._session, self._node = session, node
+        self._back: dict[tuple[int, int], dict[str, CloudMessage]] = {}
+        profile = cloud_profile(10)
+        self._publisher = session.node.create_publisher(PointCloud2, INPUT, profile)
+        for topic in OUTPUTS:
+            take = partial(self._take, topic)
+            session.node.create_subscription(PointCloud2, topic, take, profile, raw=True)
+
+    def connect(self, cloud: CloudMessage) -> None:
+        """Send a cloud until the node answers, and has the backend that it keeps."""
+        first = with_header(cloud, (1, 0))
+        end = time.monotonic() + START_TIMEOUT
+        while self._ask(first, 0.2) is None or not self._node.is_settled():
+            if time.monotonic() > end:
+                raise GroundSegError(self._silence(START_TIMEOUT))
+
+    def ask(self, cloud: CloudMessage) -> dict[str, CloudMessage]:
+        """Send a cloud; return what the node makes of it, by topic."""
+        if (found := self._ask(cloud, PATIENCE)) is None:
+            raise GroundSegError(self._silence(PATIENCE))
+        return found
+
+    def _ask(self, cloud: CloudMessage, patience: float) -> dict[str, CloudMessage] | None:
+        self._publisher.publish(encode_cloud(cloud))
+        stamp, end = stamp_of(cloud), time.monotonic() + patience
+        while time.monotonic() < end:
+            self._session.spin(0.02)
+            self._node.check()
+            if len(self._back.get(stamp, ())) == len(OUTPUTS):
+                return self._back.pop(stamp)
+        return None
+
+    def _take(self, topic: str, raw: bytes) -> None:
+        cloud = decode_cloud(raw)
+        self._back.setdefault(stamp_of(cloud), {})[topic] = cloud
+
+    def _silence(self, seconds: float) -> str:
+        topics = ' and '.join(OUTPUTS)
+        said = self._node.log_tail()
+        return f'no answer on {topics} within {seconds:g} s; the node said last:\n{said}'

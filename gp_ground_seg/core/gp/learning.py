@@ -145,7 +145,7 @@ class Learned(NamedTuple):
     theta: FloatArray  # (T,) best hyper-parameters evaluated, log space
     objective: float  # there, with the priors if any
     n_evaluations: int  # of objective and gradient
-    status: str  # one of `STATUSES`
+    status: str  # one of `STATUSES`; 'kept' where nothing was learned
     at_bound: BoolArray  # (T,) free entries that ended at a bound
 
     @classmethod
@@ -156,6 +156,12 @@ class Learned(NamedTuple):
         near_bound = (theta <= space.lower + AT_BOUND) | (theta >= space.upper - AT_BOUND)
         at_bound = space.free & near_bound & (n > 0)
         return cls(theta, objective, n, STATUSES[status], at_bound)
+
+    @classmethod
+    def given(cls, config: Config) -> Learned:
+        """Values given by the configuration, and nothing learned."""
+        theta = given_theta(config)
+        return cls(theta, math.nan, 0, 'kept', np.zeros(len(theta), np.bool_))
 
 
 def learn_frame(frame: Frame, config: Config) -> Learned:
