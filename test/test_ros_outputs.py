@@ -84,9 +84,8 @@ def test_ground_model_gives_the_height_anywhere(b):
 
 
 REDUCED = {
-    'output.min_height': 0.3, 'output.max_height': 1.2, 'output.max_range': 20.0,
-    'output.ground_voxel': 0.5, 'output.obstacle_voxel': 0.2, 'output.cell_size': 0.25,
-    'output.grid_size': 30.0,
+    'output.min_height': 0.3, 'output.max_height': 1.2, 'output.cell_size': 0.25,
+    'output.grid_size': 30.0, 'grid.r_max': 80.0,
 }  # fmt: skip
 
 
@@ -102,19 +101,15 @@ def reduced(b):
     assert all(result.successful for result in b.load(before))
 
 
-def test_clouds_are_reduced_to_heights_range_and_voxels(b, reduced):
+def test_obstacles_are_those_between_the_heights(b, reduced):
     message, expected = reduced
-    height, r = expected.segmentation.labelled.height, expected.segmentation.grid.r
-    for part, chosen, voxel in zip(
-        b.segment(message), (expected.is_ground, expected.is_obstacle), (0.5, 0.2), strict=True
+    rows = ros.rows_of(message)
+    for part, chosen in zip(
+        b.segment(message), (expected.is_ground, expected.is_obstacle), strict=True
     ):
-        kept = expected.thinned(chosen, voxel)
-        rows = ros.rows_of(message)
-        assert ros.rows_of(part) == [rows[k] for k in np.flatnonzero(kept)]
+        assert ros.rows_of(part) == [rows[k] for k in np.flatnonzero(chosen)]
         assert part.header == message.header
-        assert 100 < part.width < chosen.sum()
-        assert r[kept].max() <= 20.0
-    heights = height[expected.is_obstacle]
+    heights = expected.segmentation.labelled.height[expected.is_obstacle]
     assert not (heights < 0.3).any() and not (heights > 1.2).any() and len(heights) > 300
 
 
@@ -128,14 +123,14 @@ def test_scan_is_what_a_costmap_takes(b, reduced):
         expected.places(expected.segmentation.label != Label.UNKNOWN),
     )
     np.testing.assert_array_equal(ranges, costmap.scan_ranges(*places))
-    assert found.range_min == 0.0 and found.range_max == 20.0
+    assert found.range_min == 0.0 and found.range_max == 80.0
     assert len(ranges) * found.angle_increment == pytest.approx(2.0 * np.pi)
-    # As laser_geometry places them: each on an obstacle.
+    # As laser_geometry places them: each on an obstacle of its direction.
     hit = np.isfinite(ranges)
     angle = found.angle_min + found.angle_increment * np.flatnonzero(hit)
     x, y = ranges[hit] * np.cos(angle), ranges[hit] * np.sin(angle)
     apart = np.hypot(*(a[:, None] - p for a, p in zip((x, y), places[0], strict=True)))
-    assert hit.sum() > 300 and apart.min(axis=1).max() < 0.1
+    assert hit.sum() > 300 and (apart.min(axis=1) / ranges[hit]).max() < np.pi / len(ranges) + 1e-6
 
 
 def test_occupancy_is_what_a_costmap_takes(b, reduced):

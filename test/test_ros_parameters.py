@@ -324,16 +324,20 @@ def test_unknown_names_are_reported_and_not_declared(tmp_path):
 def test_what_is_removed_is_a_warning_at_the_start_and_refused_later(tmp_path):
     """A node with the parameter file of an earlier release starts; all else in it holds."""
     path = tmp_path / 'old.yaml'
-    groups = {'learning': {'mode': 'every_k', 'period': 3, 'segment_step': 20}}
+    groups = {
+        'learning': {'mode': 'every_k', 'period': 3, 'segment_step': 20},
+        'output': {'max_range': 20.0},
+    }
     path.write_text(yaml.safe_dump({'/**': {'ros__parameters': groups}}))
     with ros.stderr_in(tmp_path) as stderr, ros.started_node('--params-file', str(path)) as node:
         assert node.config == Config().replace(**{'learning.segment_step': 20})
-        log = ros.said_by(stderr, 'learning.period')
-        for key in ('learning.mode=every_k', 'learning.period'):
+        log = ros.said_by(stderr, 'output.max_range')
+        for key in ('learning.mode=every_k', 'learning.period', 'output.max_range'):
             name, line = key.split('=')[0], f'{key} was removed: {REMOVED[key]}'
             assert log.count(f'parameter {name} is not used: {line}\n') == 1
-            assert not node.has_parameter('learning.period')
-            value = Parameter(name, value=groups['learning'][name.split('.')[1]])
+            assert name == 'learning.mode' or not node.has_parameter(name)
+            group, field = name.split('.')
+            value = Parameter(name, value=groups[group][field])
             result = node.set_parameters_atomically([value])
             assert (result.successful, result.reason) == (False, line)
 

@@ -299,14 +299,6 @@ def test_off_nothing_is_looked_for(monkeypatch):
         np.testing.assert_array_equal(place, obstacle)
 
 
-def test_edges_beyond_the_range_are_none():
-    terrain, sensor = drop(6.0, 0.6), MOUNTED['hdl-64e']
-    every, near = segmented(terrain, sensor), segmented(terrain, sensor, **{'output.max_range': 8})
-    distance = np.hypot(*every.edges.T[:2])
-    np.testing.assert_array_equal(near.edges, every.edges[distance <= 8.0])
-    assert 0 < len(near.edges) < len(every.edges)
-
-
 def test_edges_lie_where_the_ground_ends_in_any_frame():
     """A tilted sensor, a cloud in the frame of the vehicle on the ground, an output frame."""
     terrain, sensor = drop(6.0, 0.6, 0.3), MOUNTED['hdl-64e']

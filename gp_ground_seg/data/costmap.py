@@ -1,4 +1,4 @@
-"""What a costmap takes of a segmented scan: fewer points, the nearest obstacles, a grid of cells.
+"""What a costmap takes of a segmented scan: the nearest obstacles, a grid of cells.
 
 Places are two arrays x and y, (n,) each, in the plane of the map [m]; directions are `DIRECTIONS`
 equal sectors, counter-clockwise from -x.
@@ -31,14 +31,10 @@ from gp_ground_seg.data.step_edges import find_edges
 DIRECTIONS = 720
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Values of cells, those of ``nav_msgs/OccupancyGrid``."""
-SMALLEST_VOXEL = 1e-3  # below it every point is kept: no sensor is that precise [m]
 
 # Plain integers: comparing with an enumeration is five times slower.
 _GROUND, _OBSTACLE = int(Label.GROUND), int(Label.OBSTACLE)
-_VOXELS = 1 << 20  # of an axis on each side of 0; points beyond belong to the last
-_SLOT_BITS = 18
 _ROWS = 32  # rows of cells at a time: their arrays stay in the cache
-_ODD = 0x9E3779B97F4A7C15  # 2**64 over the golden ratio: spreads keys that differ little
 
 Ranges = npt.NDArray[np.float32]
 Places = tuple[PointArray, PointArray]
@@ -86,36 +82,24 @@ class SegmentedCloud:
 
     @cached_property
     def is_ground(self) -> BoolArray:
-        """Ground points within the range, (N,) bool."""
-        return self._within_range(self.segmentation.label == _GROUND)
+        """Ground points, (N,) bool."""
+        is_ground: BoolArray = self.segmentation.label == _GROUND
+        return is_ground
 
     @cached_property
     def is_obstacle(self) -> BoolArray:
-        """Obstacle points within the range and between the heights, (N,) bool.
+        """Obstacle points between the heights, (N,) bool.
 
         Heights are over the surface that the labels follow from. A point without a height, where
         there is no model, may stand in the way: it is one of them.
         """
-        chosen = self._within_range(self.segmentation.label == _OBSTACLE)
+        chosen: BoolArray = self.segmentation.label == _OBSTACLE
         output, height = self.config.output, self.segmentation.labelled.height
         if output.min_height > -ANY_HEIGHT:
             chosen &= ~(height < output.min_height)
         if output.max_height < ANY_HEIGHT:
             chosen &= ~(height > output.max_height)
         return chosen
-
-    def _within_range(self, chosen: BoolArray) -> BoolArray:
-        limit = self.config.output.max_range
-        return chosen & (self.segmentation.grid.r <= limit) if limit > 0.0 else chosen
-
-    def thinned(self, chosen: BoolArray, voxel: float) -> BoolArray:
-        """Those of the `chosen`, (N,) bool, that are the first in their cube of `voxel` [m]."""
-        if voxel < SMALLEST_VOXEL:
-            return chosen
-        kept = np.zeros_like(chosen)
-        index = np.flatnonzero(chosen)
-        kept[index[first_of_voxels(self.points[index], voxel)]] = True
-        return kept
 
     @property
     def offset(self) -> tuple[float, float]:
@@ -145,7 +129,7 @@ class SegmentedCloud:
 
     @cached_property
     def edges(self) -> FloatArray:
-        """Points along the edges of drops within the range, (n, 3) in the frame of the cloud [m].
+        """Points along the edges of drops, (n, 3) in the frame of the cloud [m].
 
         Where ``output.max_step_down`` is 0, none are looked for.
         """
@@ -158,11 +142,7 @@ class SegmentedCloud:
         with np.errstate(over='ignore', invalid='ignore'):
             xyz = (self.points - found.origin) @ found.pose.rotation.T
         edges = find_edges(xyz, found.label == _GROUND, stands, output.max_step_down)
-        points = edges.points() @ found.pose.rotation + found.origin
-        if output.max_range > 0.0:
-            level = points @ found.pose.rotation.T
-            points = points[np.hypot(level[:, 0], level[:, 1]) <= output.max_range]
-        return points
+        return edges.points() @ found.pose.rotation + found.origin
 
     def _in_plane(self, x: PointArray, y: PointArray, z: PointArray) -> Places:
         """Places of points of the cloud, (n,) each, as `places` gives them."""
@@ -189,35 +169,6 @@ class SegmentedCloud:
         if self.placement is not None:
             turn = turn @ self.placement.rotation.T
         return turn[:2, :2]
-
-
-@np.errstate(over='ignore')
-def first_of_voxels(xyz: PointArray, size: float) -> BoolArray:
-    """Which points (N, 3) are the first in their cube of `size` [m], (N,) bool.
-
-    Points must be finite, and the size at least `SMALLEST_VOXEL`.
-    """
-    key = np.zeros(len(xyz), dtype=np.int64)
-    for values in xyz.T:
-        place = np.floor(np.clip(values / size, -_VOXELS, _VOXELS - 1))
-        key = key << 21 | (place.astype(np.int64) + _VOXELS)
-    # A sort would take ten times as long as this hash table: each pass finds the first point of
-    # every slot, and only points of other voxels in the same slot remain.
-    is_first = np.zeros(len(xyz), dtype=np.bool_)
-    rest, factor = np.flatnonzero(np.append(True, key[1:] != key[:-1])[: len(key)]), _ODD
-    key = key[rest]
-    table = np.empty(1 << _SLOT_BITS, dtype=np.int32)
-    while len(rest):
-        mixed = key.view(np.uint64) * np.uint64(factor)
-        slot = (mixed >> np.uint64(64 - _SLOT_BITS)).astype(np.int64)
-        # Of equal indices the last one counts.
-        table[slot[::-1]] = np.arange(len(rest) - 1, -1, -1)
-        first = table[slot]
-        is_first[rest[first]] = True
-        others = np.flatnonzero(key[first] != key)
-        rest, key = rest[others], key[others]
-        factor = factor * _ODD % (1 << 64)
-    return is_first
 
 
 def direction_of(x: PointArray, y: PointArray) -> npt.NDArray[np.int16]:

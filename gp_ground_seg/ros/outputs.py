@@ -85,11 +85,10 @@ def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud
     return message
 
 
-def _selected(segmented: SegmentedCloud, chosen: BoolArray, voxel: float) -> PointCloud2:
-    """Return the `chosen` points, thinned to one in each `voxel` [m], in the output frame."""
-    kept = segmented.thinned(chosen, voxel)
+def _selected(segmented: SegmentedCloud, chosen: BoolArray) -> PointCloud2:
+    """Return the `chosen` points in the output frame."""
     # Ground and obstacles are finite points.
-    message = select_points(segmented.cloud, kept, message_bytes, are_finite=True)
+    message = select_points(segmented.cloud, chosen, message_bytes, are_finite=True)
     if segmented.placement is not None:
         rotation, translation = segmented.placement
         message.header = _header(segmented)
@@ -108,10 +107,10 @@ def scan(segmented: SegmentedCloud) -> LaserScan:
     Edges of drops are obstacles if ``output.max_step_down`` is not 0. Infinite where the direction
     has returns and no obstacle, NaN where it has no return.
     """
-    (x, y), config, step = segmented.offset, segmented.config, 2.0 * math.pi / DIRECTIONS
+    (x, y), step = segmented.offset, 2.0 * math.pi / DIRECTIONS
     message = LaserScan(header=_header(segmented), angle_increment=step)
     message.angle_min, message.angle_max = 0.5 * step - math.pi, math.pi - 0.5 * step
-    message.range_max = (config.output.max_range or config.grid.r_max) + math.hypot(x, y)
+    message.range_max = segmented.config.grid.r_max + math.hypot(x, y)
     returns = segmented.places(segmented.segmentation.grid.cell != NOT_FINITE)
     moved = [(px + x, py + y) for px, py in (segmented.blocked, returns)]
     message.ranges = message_data(scan_ranges(*moved), 'f')
@@ -139,18 +138,8 @@ LABELLED = Output(
     '~/labeled', PointCloud2, lambda s: labelled_cloud(s.cloud, s.segmentation), True
 )
 OUTPUTS = (
-    Output(
-        'ground',
-        PointCloud2,
-        lambda s: _selected(s, s.is_ground, s.config.output.ground_voxel),
-        False,
-    ),
-    Output(
-        'obstacles',
-        PointCloud2,
-        lambda s: _selected(s, s.is_obstacle, s.config.output.obstacle_voxel),
-        False,
-    ),
+    Output('ground', PointCloud2, lambda s: _selected(s, s.is_ground), False),
+    Output('obstacles', PointCloud2, lambda s: _selected(s, s.is_obstacle), False),
     LABELLED,
     Output(
         '~/ground_model',

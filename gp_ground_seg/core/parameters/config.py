@@ -79,11 +79,6 @@ class OutputConfig:
         'least height over the ground of an obstacle; -100 = any', 'm')
     max_height: float = advanced(ANY_HEIGHT, (-ANY_HEIGHT, ANY_HEIGHT),
         'greatest height over the ground of an obstacle; 100 = any', 'm')
-    max_range: float = advanced(0.0, (0.0, 500.0),
-        'greatest horizontal range; 0 = any', 'm')
-    ground_voxel: float = advanced(0.0, (0.0, 10.0),
-        'side of the cubes whose first point ground has; 0 = every point', 'm')
-    obstacle_voxel: float = advanced(0.0, (0.0, 10.0), 'the same for obstacles', 'm')
     cell_size: float = advanced(0.1, (0.05, 5.0), 'side of a cell of occupancy', 'm')
     grid_size: float = advanced(40.0, (1.0, 100.0), 'side of the square of occupancy', 'm')
     max_step_down: float = advanced(0.0, (0.0, 10.0),

@@ -20,6 +20,9 @@ REMOVED: dict[str, str] = {
     'learning.warm_start': 'leave it out: learning starts from the lines of each frame',
     'learning.max_time': 'use learning.max_evaluations',
     'input.max_cloud_size': 'leave it out: clouds of any size are taken',
+    'output.max_range': 'leave it out: costmaps have ranges of their own (docs/nav2.md)',
+    'output.ground_voxel': 'leave it out: costmaps have voxels of their own (docs/nav2.md)',
+    'output.obstacle_voxel': 'leave it out: costmaps have voxels of their own (docs/nav2.md)',
     '~/markers': 'use ~/ground_model: RViz and Foxglove colour it by std or length_scale',
     'runtime.n_threads': 'leave it out: a scan takes one thread; --workers takes several scans',
     f'{PROGRAM} config diff': (
