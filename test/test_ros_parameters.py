@@ -327,12 +327,14 @@ def test_what_is_removed_is_a_warning_at_the_start_and_refused_later(tmp_path):
     groups = {
         'learning': {'mode': 'every_k', 'period': 3, 'segment_step': 20},
         'output': {'max_range': 20.0},
+        'diagnostics': {'recover_after': 0.0},
     }
     path.write_text(yaml.safe_dump({'/**': {'ros__parameters': groups}}))
     with ros.stderr_in(tmp_path) as stderr, ros.started_node('--params-file', str(path)) as node:
         assert node.config == Config().replace(**{'learning.segment_step': 20})
         log = ros.said_by(stderr, 'output.max_range')
-        for key in ('learning.mode=every_k', 'learning.period', 'output.max_range'):
+        removed = 'learning.period', 'diagnostics.recover_after', 'output.max_range'
+        for key in ('learning.mode=every_k', *removed):
             name, line = key.split('=')[0], f'{key} was removed: {REMOVED[key]}'
             assert log.count(f'parameter {name} is not used: {line}\n') == 1
             assert name == 'learning.mode' or not node.has_parameter(name)

@@ -22,7 +22,6 @@ PATIENT = {
     'diagnostics.period': 0.2,
     'diagnostics.stale_after': 60.0,
     'diagnostics.max_latency': 10.0,
-    'diagnostics.max_load': 100.0,
 }
 # Nor be one: a node that cannot run for four seconds at 10 Hz loses nothing.
 WORDS = ros.given({**PATIENT, f'qos_overrides.{NAMESPACE}/points.subscription.depth': 40})

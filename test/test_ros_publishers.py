@@ -16,8 +16,7 @@ from gp_ground_seg.ros.input import SequenceGaps
 # A busy machine must not look like a fault.
 CHANGES = {
     'learning.mode': 'fixed', 'runtime.backend': 'numpy', 'grid.n_segments': 16,
-    'diagnostics.period': 0.2, 'diagnostics.recover_after': 0.0, 'diagnostics.max_latency': 10.0,
-    'diagnostics.max_load': 100.0, 'diagnostics.stale_after': 60.0,
+    'diagnostics.period': 0.2, 'diagnostics.max_latency': 10.0, 'diagnostics.stale_after': 60.0,
 }  # fmt: skip
 SMALL = to_message(street(500))
 MIDDLE = to_message(street(6000))

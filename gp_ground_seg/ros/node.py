@@ -110,7 +110,9 @@ class GroundSegmentationNode(ConfiguredNode):
         else:
             end, health = time.monotonic(), self._diagnostics
             stages = {'queue': wait, **segmentation.timings, 'publish': end - segmented}
-            health.processing.processed(end - start, stages, segmentation.fit)
+            times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
+            self.get_logger().debug(f'times of the stages [ms]: {times}')
+            health.processing.processed(wait + end - start, segmentation.fit.backend)
             health.model.segmented(segmentation)
             health.output.published(end, topics)
 
@@ -124,7 +126,7 @@ class GroundSegmentationNode(ConfiguredNode):
         fields = [field.name for field in cloud.fields]
         self._time_jumps.note(stamp)
         self._diagnostics.input.arrived(now, stamp, cloud.header.frame_id, fields)
-        self._diagnostics.processing.arrived(now, n_lost)
+        self._diagnostics.processing.arrived(n_lost)
 
     def _segment(self, cloud: PointCloud2) -> Segmentation:
         """Return the segmentation of a cloud; raise a PointCloudError if it has none."""

@@ -268,17 +268,6 @@ class DiagnosticsConfig:
         'time without any cloud after which the input is reported STALE', 's')
     max_latency: float = advanced(0.1, (0.001, 10.0),
         'median time from arrival to publication above which processing is reported WARN', 's')
-    max_load: float = advanced(0.95, (0.01, 100.0),
-        'median time per cloud, over the time between two clouds sent, above which processing is '
-        'reported WARN')
-    max_drop_ratio: float = advanced(0.0, (0.0, 1.0),
-        'dropped share of the clouds since the last report above which processing is WARN')
-    max_refused_ratio: float = advanced(0.0, (0.0, 1.0),
-        'refused share above which the input is ERROR instead of WARN; all refused: always ERROR')
-    min_quality: float = advanced(0.2, (0.0, 1.0),
-        'frame_quality of the newest cloud below which the model is reported WARN')
-    recover_after: float = advanced(3.0, (0.0, 600.0),
-        'time that a level stays reported after its cause has gone', 's')
 # fmt: on
 
 

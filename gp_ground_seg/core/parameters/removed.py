@@ -23,6 +23,11 @@ REMOVED: dict[str, str] = {
     'output.max_range': 'leave it out: costmaps have ranges of their own (docs/nav2.md)',
     'output.ground_voxel': 'leave it out: costmaps have voxels of their own (docs/nav2.md)',
     'output.obstacle_voxel': 'leave it out: costmaps have voxels of their own (docs/nav2.md)',
+    'diagnostics.max_load': 'use diagnostics.max_latency; clouds that are lost are always a WARN',
+    'diagnostics.max_drop_ratio': 'leave it out: clouds that are lost are always a WARN',
+    'diagnostics.max_refused_ratio': 'leave it out: a cloud that is refused is always an ERROR',
+    'diagnostics.min_quality': 'leave it out: the status model says what is doubtful',
+    'diagnostics.recover_after': 'leave it out: a level ends with its cause',
     '~/markers': 'use ~/ground_model: RViz and Foxglove colour it by std or length_scale',
     'runtime.n_threads': 'leave it out: a scan takes one thread; --workers takes several scans',
     f'{PROGRAM} config diff': (
