@@ -1,4 +1,4 @@
-"""Start the node, and RViz and a bag if asked for; with --show-args it prints its arguments.
+"""Start the node, and RViz if asked for; with --show-args it prints its arguments.
 
 ros2 launch gp_ground_seg ground_segmentation.launch.py topic:=/velodyne_points rviz:=true
 """
@@ -14,7 +14,6 @@ from ament_index_python.packages import (
 from launch import LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
-    ExecuteProcess,
     LogInfo,
     OpaqueFunction,
     Shutdown,
@@ -22,29 +21,27 @@ from launch.actions import (
 )
 from launch_ros.actions import Node
 
+from gp_ground_seg.core.parameters.removed import LAUNCH_FILE, removal
+
 SHARE = Path(get_package_share_directory('gp_ground_seg'))
+NODE = 'ground_segmentation_node'
 OUTPUTS = ('ground', 'obstacles')
 OPTIONAL = ('labeled', 'ground_model', 'scan', 'occupancy')
 
 ARGUMENTS = (
     ('topic', 'points', 'PointCloud2 topic of the LiDAR'),
-    ('ground', 'ground', 'topic of the ground'),
-    ('obstacles', 'obstacles', 'topic of the obstacles'),
     ('params_file', '', 'parameter file, or the name of one of config/: default, paper'),
     ('params', '{}', "more parameters, as YAML: '{sensor.height: 1.2, learning.mode: fixed}'"),
-    ('name', 'ground_segmentation_node', 'name of the node'),
     ('namespace', '', 'namespace of the node and of its outputs'),
-    ('log_level', 'info', 'level of its log: debug, info, warn, error'),
-    ('respawn', 'false', 'start the node again when it ends; else the launch ends with it'),
-    ('respawn_delay', '1.0', 'seconds before that'),
     ('use_sim_time', 'false', 'use the time of /clock: true or false'),
-    ('bag', '', 'bag to play with ros2 bag, 3 s after the start, and to take the time of'),
     ('rviz', 'false', 'start RViz beside it: true or false'),
     (
         'frame',
         'velo_link',
         'fixed frame of RViz: that of the clouds, or one that TF connects to it',
     ),
+    ('log_level', 'info', 'level of the log of the node: debug, info, warn, error'),
+    ('required', 'true', 'end the launch when the node ends: true or false'),
 )
 
 
@@ -54,13 +51,6 @@ def _boolean(values, name):
     if text not in ('true', '1', 'false', '0'):
         raise ValueError(f'{name}:={values[name]}: must be true or false')
     return text in ('true', '1')
-
-
-def _number(values, name):
-    try:
-        return float(values[name])
-    except ValueError:
-        raise ValueError(f'{name}:={values[name]}: must be a number') from None
 
 
 def _parameters(values):
@@ -78,7 +68,7 @@ def _parameters(values):
         more = None
     if not isinstance(more, dict):
         raise ValueError(f"params:={values['params']}: must be YAML as '{{sensor.height: 1.2}}'")
-    if _is_simulated(values):
+    if _boolean(values, 'use_sim_time'):
         more['use_sim_time'] = True
     return [*found, more] if more else found
 
@@ -90,58 +80,46 @@ def _end(event, context):
     return Shutdown(reason='the node has ended')
 
 
-def _is_simulated(values):
-    return _boolean(values, 'use_sim_time') or bool(values['bag'])
-
-
-def _rviz(values, namespace):
+def _rviz(values, place):
     try:
         get_package_prefix('rviz2')
     except PackageNotFoundError:
         return LogInfo(msg='rviz2 is not installed: the node runs without it')
-    # The topics of the displays, and where they are now.
-    shown = {f'/{name}': values[name] for name in OUTPUTS}
-    for name in OPTIONAL:
-        shown[f'/ground_segmentation_node/{name}'] = f'{values["name"]}/{name}'
+    topics = [*OUTPUTS, *(f'{NODE}/{name}' for name in OPTIONAL)]
     file = SHARE / 'config' / 'ground_segmentation.rviz'
     return Node(
         package='rviz2',
         executable='rviz2',
         arguments=['-d', str(file), '-f', values['frame']],
-        parameters=[{'use_sim_time': _is_simulated(values)}],
-        remappings=[
-            (topic, now if now.startswith('/') else f'{namespace}/{now}')
-            for topic, now in shown.items()
-        ],
+        parameters=[{'use_sim_time': _boolean(values, 'use_sim_time')}],
+        remappings=[(f'/{topic}', '/'.join(['', *place, topic])) for topic in topics],
     )
 
 
 def _actions(context):
-    values = {name: context.launch_configurations[name] for name, _, _ in ARGUMENTS}
-    is_respawned = _boolean(values, 'respawn')
-    namespace = values['namespace'].strip('/')
+    values = context.launch_configurations
+    for name, value in values.items():
+        if value and (line := removal(f'{LAUNCH_FILE} {name}')):
+            raise ValueError(line)
+    # A launch file around this one may have pushed a namespace.
+    parts = values.get('ros_namespace', ''), values['namespace']
+    place = [part for text in parts for part in text.split('/') if part]
     actions = [
         Node(
             package='gp_ground_seg',
-            executable='ground_segmentation_node',
-            name=values['name'],
-            namespace=namespace or None,
+            executable=NODE,
+            name=NODE,
+            namespace=values['namespace'].strip('/') or None,
             parameters=_parameters(values),
-            remappings=[('points', values['topic']), *((name, values[name]) for name in OUTPUTS)],
-            ros_arguments=['--log-level', values['log_level']],
+            remappings=[('points', values['topic'])],
+            # Of this node: with the level alone, its middleware would log as much.
+            ros_arguments=['--log-level', f'{".".join([*place, NODE])}:={values["log_level"]}'],
             output='screen',
-            respawn=is_respawned,
-            respawn_delay=_number(values, 'respawn_delay'),
-            on_exit=None if is_respawned else _end,
+            on_exit=_end if _boolean(values, 'required') else None,
         )
     ]
     if _boolean(values, 'rviz'):
-        # A launch file around this one may have pushed a namespace.
-        parts = context.launch_configurations.get('ros_namespace', '').strip('/'), namespace
-        actions.append(_rviz(values, ''.join(f'/{part}' for part in parts if part)))
-    if bag := values['bag']:
-        command = ['ros2', 'bag', 'play', bag, '--clock', '--delay', '3']
-        actions.append(ExecuteProcess(cmd=command, output='screen'))
+        actions.append(_rviz(values, place))
     return actions
 
 

@@ -1,4 +1,4 @@
-"""The launch files: with launch_ros, where ROS is installed from apt; else with a stand-in."""
+"""The launch file: with launch_ros, where ROS is installed from apt; else with a stand-in."""
 
 import ast
 import re
@@ -11,8 +11,11 @@ import pytest
 import yaml
 from conftest import REPOSITORY, load_script
 
+from gp_ground_seg.core.parameters.removed import REMOVED
+
 FILE = REPOSITORY / 'launch' / 'ground_segmentation.launch.py'
 PAGE = (REPOSITORY / 'docs' / 'node.md').read_text(encoding='utf-8')
+(EXAMPLE,) = re.findall(r'```python\n(from launch import .*?)```', PAGE, re.DOTALL)
 
 
 def constants(path):
@@ -34,27 +37,20 @@ def test_the_page_has_the_arguments_and_their_defaults():
 def test_rviz_is_told_of_each_topic_that_it_shows():
     found = dict(constants(FILE))
     names = {f'/{name}' for name in found['OUTPUTS']}
-    names |= {f'/ground_segmentation_node/{name}' for name in found['OPTIONAL']}
+    names |= {f'/{found["NODE"]}/{name}' for name in found['OPTIONAL']}
     text = (REPOSITORY / 'config' / 'ground_segmentation.rviz').read_text(encoding='utf-8')
     displays = yaml.safe_load(text)['Visualization Manager']['Displays']
     assert names == {one['Topic']['Value'] for one in displays if 'Topic' in one}
 
 
-def test_the_example_sets_arguments_that_exist():
-    declared = {name for name, _, _ in dict(constants(FILE))['ARGUMENTS']}
-    sensors = dict(constants(FILE.with_name('two_sensors.launch.py')))['SENSORS']
-    assert len(sensors) == 2
-    for arguments in sensors.values():
-        assert set(arguments) <= declared
-        assert yaml.safe_load(arguments['params']).keys() == {'sensor.height'}
-
-
-WRONG = 'params_file:=/no/such.yaml', 'params:=3', 'rviz:=perhaps', 'respawn_delay:=soon'
+OURS = 'gp_ground_seg', FILE.name
+WRONG = 'params_file:=/no/such.yaml', 'params:=3', 'rviz:=perhaps', 'required:=soon'
+GONE = [key.split()[1] for key in REMOVED if key.startswith(f'{FILE.name} ')]
 
 
 def launched(*words):
     """Log of ``ros2 launch``, interrupted after the time that a node needs to start."""
-    command = ['timeout', '--signal', 'INT', '20', 'ros2', 'launch', 'gp_ground_seg', *words]
+    command = ['timeout', '--signal', 'INT', '20', 'ros2', 'launch', *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     return done.stdout + done.stderr
 
@@ -72,29 +68,37 @@ def ros2_launch():
 def test_launch_starts_the_node(ros2_launch):
     lines = 'sensor.height: 1.2 m', 'listening to /lidar', 'front.ground_segmentation_node'
     words = 'topic:=/lidar', 'namespace:=front', 'params:={sensor.height: 1.2}'
-    log = launched(FILE.name, *words)
+    log = launched(*OURS, *words)
     assert all(line in log for line in lines)
 
 
-def test_launch_starts_two_nodes(ros2_launch):
+def test_launch_starts_the_two_nodes_of_the_page(ros2_launch, tmp_path):
     lines = 'listening to /lidar_front/points', 'listening to /lidar_rear/points'
-    log = launched('two_sensors.launch.py')
+    path = tmp_path / 'two.launch.py'
+    path.write_text(EXAMPLE)
+    log = launched(path)
     assert all(line in log for line in lines)
 
 
 @pytest.mark.parametrize('word', WRONG)
 def test_launch_refuses(ros2_launch, word):
     name = word.partition(':=')[0]
-    assert f'{name}:=' in launched(FILE.name, word)
+    assert f'{name}:=' in launched(*OURS, word)
+
+
+@pytest.mark.parametrize('name', GONE)
+def test_launch_says_what_to_use_instead(ros2_launch, name):
+    key = f'{FILE.name} {name}'
+    assert f'{key} was removed: {REMOVED[key]}' in launched(*OURS, f'{name}:=1')
 
 
 @pytest.mark.parametrize('word', ['rviz:=True', 'use_sim_time:=True'])
 def test_launch_takes_what_nav2_writes(ros2_launch, word):
-    assert 'listening to' in launched(FILE.name, word)
+    assert 'listening to' in launched(*OURS, word)
 
 
 def test_launch_ends_with_the_node_and_its_code(ros2_launch):
-    command = ['ros2', 'launch', 'gp_ground_seg', FILE.name, 'params:={grid.r_max: -1.0}']
+    command = ['ros2', 'launch', *OURS, 'params:={grid.r_max: -1.0}']
     assert subprocess.run(command, timeout=60, check=False).returncode == 1
 
 
@@ -103,12 +107,12 @@ def test_launch_ends_with_the_node_and_its_code(ros2_launch):
 STAND_IN = {
     'launch': ['LaunchDescription'],
     'launch.actions': [
-        'DeclareLaunchArgument', 'ExecuteProcess', 'GroupAction', 'IncludeLaunchDescription',
-        'LogInfo', 'OpaqueFunction', 'Shutdown', 'TimerAction',
+        'DeclareLaunchArgument', 'GroupAction', 'IncludeLaunchDescription', 'LogInfo',
+        'OpaqueFunction', 'Shutdown', 'TimerAction',
     ],
     'launch.launch_description_sources': ['PythonLaunchDescriptionSource'],
-    'launch.substitutions': ['LaunchConfiguration'],
     'launch_ros.actions': ['Node'],
+    'launch_ros.substitutions': ['FindPackageShare'],
 }  # fmt: skip
 
 
@@ -158,9 +162,8 @@ def test_each_argument_reaches_the_node(actions, tmp_path):
     ros = pytest.importorskip('ros_helpers', reason='ROS is not installed')
     namespace = ros.NAMESPACE.strip('/')
     (_, node), (kind, note) = actions(
-        'topic:=lidar', 'ground:=free', 'obstacles:=/taken', f'namespace:={namespace}',
-        'name:=cutter', 'log_level:=debug', 'use_sim_time:=True', 'rviz:=1',
-        'params:={diagnostics.period: 0.1}',
+        'topic:=lidar', f'namespace:={namespace}', 'log_level:=debug', 'use_sim_time:=True',
+        'rviz:=1', 'params:={diagnostics.period: 0.1}',
     )  # fmt: skip
     # There is no RViz here: one line says so, and the node starts.
     assert kind == 'LogInfo' and 'rviz2 is not installed' in note['msg']
@@ -170,7 +173,7 @@ def test_each_argument_reaches_the_node(actions, tmp_path):
     ):
         probe = ros.Node('probe', context=context, namespace=ros.NAMESPACE)
         lidar = probe.create_publisher(ros.PointCloud2, 'lidar', ros.RELIABLE)
-        outputs = [ros.Collector(probe, ros.PointCloud2, name) for name in ('free', '/taken')]
+        outputs = [ros.Collector(probe, ros.PointCloud2, name) for name in ('ground', 'obstacles')]
         reports = ros.Collector(probe, ros.DiagnosticArray, '/diagnostics')
         with ros.spinning(context, probe):
             cloud = ros.to_message(ros.street(1000))
@@ -179,20 +182,23 @@ def test_each_argument_reaches_the_node(actions, tmp_path):
             )
             n_reports = len(reports.messages)
             statuses = reports.wait(n_reports + 2)[-1].status
-        assert {status.hardware_id for status in statuses} == {f'{ros.NAMESPACE}/cutter'}
+        full_name = f'{ros.NAMESPACE}/ground_segmentation_node'
+        assert {status.hardware_id for status in statuses} == {full_name}
         values = {k: v for status in statuses for k, v in ros.values_of(status).items()}
         assert values['Clock'].startswith('simulated')
-        assert '[DEBUG]' in process.log
+        # The log of the node, and of nothing else.
+        loggers = re.findall(r'\[DEBUG\] \[[\d.]+\] \[([\w.]+)\]', process.log)
+        assert set(loggers) == {f'{namespace}.ground_segmentation_node'}
         assert process.stop(signal.SIGINT)[0] == 0
 
 
 @pytest.mark.parametrize('text', ['false', 'False', '0'])
 def test_nothing_else_starts_unless_asked_for(actions, text):
-    ((_, node),) = actions(f'rviz:={text}', f'use_sim_time:={text}', f'respawn:={text}')
+    ((_, node),) = actions(f'rviz:={text}', f'use_sim_time:={text}')
     assert node['parameters'] == []
 
 
-def test_launch_ends_with_a_node_that_fails_unless_it_is_respawned(actions, tmp_path):
+def test_launch_ends_with_a_node_that_fails_unless_it_is_not_required(actions, tmp_path):
     ros = pytest.importorskip('ros_helpers', reason='ROS is not installed')
     ((_, node),) = actions('params:={grid.r_max: -1.0}')
     with ros.Process(*command_of(node), folder=tmp_path) as process:
@@ -203,47 +209,59 @@ def test_launch_ends_with_a_node_that_fails_unless_it_is_respawned(actions, tmp_
     for event.returncode, is_shutdown in ((2, True), (0, False)):
         ended = node['on_exit'](event, SimpleNamespace(is_shutdown=is_shutdown))
         assert type(ended).__name__ == 'Shutdown'
-    ((_, node),) = actions('respawn:=True', 'respawn_delay:=2')
-    assert (node['respawn'], node['respawn_delay'], node['on_exit']) == (True, 2.0, None)
+    ((_, node),) = actions('required:=False')
+    assert node['on_exit'] is None
+
+
+def failure_of(*found):
+    """Why nothing starts: said when launch knows all processes that it has to end."""
+    ((kind, timer),) = found
+    assert kind == 'TimerAction'
+    (failure,) = timer['actions']
+    with pytest.raises(RuntimeError) as raised:
+        failure.options['function'](None)
+    return str(raised.value)
 
 
 @pytest.mark.parametrize('word', [*WRONG, 'use_sim_time:=yes'])
-def test_a_wrong_argument_starts_nothing_and_fails_when_launch_can_end_the_rest(actions, word):
-    ((kind, timer),) = actions(word)
-    assert kind == 'TimerAction'
-    (failure,) = timer['actions']
-    with pytest.raises(RuntimeError, match=re.escape(word)):
-        failure.options['function'](None)
+def test_a_wrong_argument_starts_nothing(actions, word):
+    assert failure_of(*actions(word)).startswith(word)
 
 
-def test_rviz_follows_the_topics_and_a_bag_gives_the_time(actions):
+@pytest.mark.parametrize('name', GONE)
+def test_an_argument_that_is_gone_says_what_to_use_instead(actions, name):
+    key = f'{FILE.name} {name}'
+    assert failure_of(*actions(f'{name}:=1')) == f'{key} was removed: {REMOVED[key]}'
+    # A launch file around this one may have it for itself, and not use it.
+    ((kind, _),) = actions(f'{name}:=')
+    assert kind == 'Node'
+
+
+@pytest.mark.parametrize('pushed', ['', '/robot'])
+def test_rviz_and_the_log_follow_the_namespace(actions, pushed):
     (actions.index / 'rviz2').touch()
-    words = 'rviz:=True', 'bag:=drive', 'ground:=/free', 'namespace:=front', 'name:=cutter'
-    (_, node), (_, rviz), (kind, bag) = actions(*words)
-    assert kind == 'ExecuteProcess' and bag['cmd'][:4] == ['ros2', 'bag', 'play', 'drive']
-    assert '--clock' in bag['cmd']
+    words = 'rviz:=True', 'namespace:=front', 'use_sim_time:=1', f'ros_namespace:={pushed}'
+    (_, node), (_, rviz) = actions(*words)
     assert node['parameters'] == rviz['parameters'] == [{'use_sim_time': True}]
-    plain, optional = '/ground_segmentation_node', dict(constants(FILE))['OPTIONAL']
-    assert rviz['remappings'] == [
-        ('/ground', '/free'), ('/obstacles', '/front/obstacles'),
-        *((f'{plain}/{name}', f'/front/cutter/{name}') for name in optional),
-    ]  # fmt: skip
+    found, place = dict(constants(FILE)), f'{pushed}/front'
+    plain = found['NODE']
+    names = [*found['OUTPUTS'], *(f'{plain}/{name}' for name in found['OPTIONAL'])]
+    assert rviz['remappings'] == [(f'/{name}', f'{place}/{name}') for name in names]
+    logger = f'{place[1:].replace("/", ".")}.{plain}'
+    assert node['ros_arguments'] == ['--log-level', f'{logger}:=info']
 
 
-@pytest.mark.parametrize('bag', ['', 'drive'])
-def test_two_sensors_have_arguments_of_their_own_and_one_bag(actions, bag):
-    description = load_script('launch/two_sensors.launch.py').generate_launch_description()
-    *declared, nodes = description.args[0]
-    assert {one.args[0]: one.options['default_value'] for one in declared[:2]} == {
-        'front_topic': '/lidar_front/points', 'front_params': '{sensor.height: 1.2}'
-    }  # fmt: skip
-    context = SimpleNamespace(launch_configurations={'bag': bag} if bag else {})
-    front, rear = (
-        dict(group.args[0][0].options['launch_arguments'])
-        for group in nodes.options['function'](context)
-    )
-    assert (front['namespace'], front['topic'].args) == ('front', ('front_topic',))
-    # The first takes bag:= as it is given; the second has its time and does not play it again.
-    assert front.keys() == {'namespace', 'topic', 'params'}
-    time = {'bag': '', 'use_sim_time': 'true'} if bag else {}
-    assert {name: rear[name] for name in rear.keys() - front.keys()} == time
+def test_the_example_of_the_page_starts_two_nodes_that_leave_each_other_alone(actions):
+    scope = {}
+    exec(compile(EXAMPLE, 'node.md', 'exec'), scope)
+    groups = scope['generate_launch_description']().args[0]
+    given = [dict(group.args[0][0].options['launch_arguments']) for group in groups]
+    assert [arguments['namespace'] for arguments in given] == ['front', 'rear']
+    declared = {name for name, _, _ in dict(constants(FILE))['ARGUMENTS']}
+    for group, arguments in zip(groups, given, strict=True):
+        assert type(group).__name__ == 'GroupAction'
+        assert group.args[0][0].args[0].args[0][1] == f'/launch/{FILE.name}'
+        assert set(arguments) <= declared
+        ((_, node),) = actions(*(':='.join(item) for item in arguments.items()))
+        assert node['on_exit'] is None
+        assert node['parameters'][0].keys() == {'sensor.height'}

@@ -33,7 +33,7 @@ def test_package_xml_is_that_of_this_package(package):
     files = [ast.parse(path.read_text()) for path in REPOSITORY.glob('launch/*.launch.py')]
     launched = {name.split('.')[0] for tree in files for name in imports(tree)}
     assert {'launch', 'launch_ros'} <= launched & depends
-    assert launched <= depends | {'pathlib', 'yaml'}
+    assert launched <= depends | {'pathlib', 'yaml', PACKAGE}
 
 
 # The order that the schema of format 3 (REP 149) asks for.

@@ -1,7 +1,7 @@
-"""Parameters, commands, options and topics of earlier releases, and what to use instead.
+"""What earlier releases had: parameters, commands, options, launch arguments and topics.
 
-Files, commands and the library refuse them with the sentence here. A node leaves them out and
-warns, for one release. A new line is all that another one needs.
+Files, commands, the launch file and the library refuse them with the sentence here. A node leaves
+them out and warns, for one release. A new line is all that another one needs.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import re
 from collections.abc import Sequence
 
 PROGRAM = 'gp-ground-seg'
+LAUNCH_FILE = 'ground_segmentation.launch.py'
 # By itself or joined to its option; not of a scheduler.
 _URL = re.compile(r'(?:-\w=?|--[\w-]+=)?((?!tcp:|tls:)[a-z][a-z0-9+.-]*://.*)', re.IGNORECASE)
 REMOVED: dict[str, str] = {
@@ -29,6 +30,16 @@ REMOVED: dict[str, str] = {
     'diagnostics.min_quality': 'leave it out: the status model says what is doubtful',
     'diagnostics.recover_after': 'leave it out: a level ends with its cause',
     '~/markers': 'use ~/ground_model: RViz and Foxglove colour it by std or length_scale',
+    f'{LAUNCH_FILE} ground': "use launch_ros.actions.SetRemap('ground', TOPIC) before the include",
+    f'{LAUNCH_FILE} obstacles': (
+        "use launch_ros.actions.SetRemap('obstacles', TOPIC) before the include"
+    ),
+    f'{LAUNCH_FILE} name': 'use namespace',
+    f'{LAUNCH_FILE} respawn': 'start ground_segmentation_node by launch_ros.actions.Node',
+    f'{LAUNCH_FILE} respawn_delay': 'start ground_segmentation_node by launch_ros.actions.Node',
+    f'{LAUNCH_FILE} bag': 'use ros2 bag play --clock BAG, and use_sim_time:=true',
+    f'{LAUNCH_FILE} threads': 'leave it out: a scan takes one thread',
+    'two_sensors.launch.py': f'include {LAUNCH_FILE} twice (docs/node.md)',
     'runtime.n_threads': 'leave it out: a scan takes one thread; --workers takes several scans',
     f'{PROGRAM} config diff': (
         f'use diff on two files, each written by {PROGRAM} config dump --config FILE'
@@ -80,8 +91,8 @@ REMOVED: dict[str, str] = {
 }
 """What to use instead, by the ``NAME`` of a parameter, by ``NAME=VALUE`` where only a value is
 removed, or by the first words of a command line: those of a command, of one below it, or of either
-and an option; of an option alone where every command had it. A topic of the node begins with
-``~/``: nothing refuses it."""
+and an option; of an option alone where every command had it; by the launch file and an argument of
+it. A topic of the node begins with ``~/``: nothing refuses it, and nothing a launch file."""
 
 
 def removal(name: str, value: object = None) -> str:
