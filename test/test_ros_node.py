@@ -358,6 +358,15 @@ def test_times_of_the_stages_are_logged_at_level_debug(b, tmp_path):
     assert sum(map(float, numbers)) > 0.0
 
 
+def test_the_wait_of_a_cloud_is_a_part_of_its_latency(b, monkeypatch):
+    latencies = []
+    task = b.node._diagnostics.processing
+    monkeypatch.setattr(task, 'processed', lambda latency, _backend: latencies.append(latency))
+    b.in_executor(b.node._on_cloud, to_message(street(500)), 100.0, 0)
+    ros.wait_for(lambda: latencies, 'latency')
+    assert 100.0 < latencies[0] < 130.0
+
+
 def test_error_in_a_report_does_not_end_the_node(b, monkeypatch):
     monkeypatch.setattr(b.node, '_outputs', None)
     status = b.wait_for_status('diagnostics', lambda *_: True)
