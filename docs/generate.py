@@ -22,8 +22,8 @@ and ranges, as a parameter file. A symbol is that of the paper.
 REMOVED_HEAD = """
 ## Removed
 
-A file, a command or a launch that has one of these ends with its line. The node leaves it out,
-and warns. Topics begin with `~/`: a subscriber of one gets no message.
+A file or a command that has one of these ends with its line. The node and the launch file leave it
+out, and warn. Topics begin with `~/`: a subscriber of one gets no message.
 
 | Removed | Instead |
 | --- | --- |

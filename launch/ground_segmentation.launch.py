@@ -98,13 +98,13 @@ def _rviz(values, place):
 
 def _actions(context):
     values = context.launch_configurations
-    for name, value in values.items():
-        if value and (line := removal(f'{LAUNCH_FILE} {name}')):
-            raise ValueError(line)
+    # Said, not refused: a launch file around this one may have the name for itself.
+    gone = [removal(f'{LAUNCH_FILE} {name}') for name, value in values.items() if value]
     # A launch file around this one may have pushed a namespace.
     parts = values.get('ros_namespace', ''), values['namespace']
     place = [part for text in parts for part in text.split('/') if part]
     actions = [
+        *(LogInfo(msg=line) for line in gone if line),
         Node(
             package='gp_ground_seg',
             executable=NODE,
