@@ -116,7 +116,7 @@ def _actions(context):
             ros_arguments=['--log-level', f'{".".join([*place, NODE])}:={values["log_level"]}'],
             output='screen',
             on_exit=_end if _boolean(values, 'required') else None,
-        )
+        ),
     ]
     if _boolean(values, 'rviz'):
         actions.append(_rviz(values, place))

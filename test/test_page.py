@@ -43,7 +43,7 @@ def test_only_who_has_the_address_is_answered(address):
 @pytest.mark.parametrize(
     ('control', 'odd'),
     [
-        *((TOLERANCE, odd) for odd in ([99999], [-1], [], [1, 2])),
+        *((TOLERANCE, odd) for odd in (99999, -1, float('nan'))),
         ('learning.mode', 'no'),
         ('colours', '<b>'),
         ('frame', 1),

@@ -74,15 +74,17 @@ class Page:
                 props = message.get('props') or message.get('updates') or {}
                 self.text += str(props)
                 if 'uuid' in message and 'label' in props:
-                    self.uuids[props['label'].partition(' = ')[0]] = message['uuid']
+                    self.uuids[props['label'].partition(' [')[0]] = message['uuid']
                 if 'value' in message or 'value' in props:
                     self.values[message['uuid']] = message.get('value', props.get('value'))
 
     def move(self):
-        """Move a slider, and wait until its title has followed."""
-        is_low = self.values[self.uuids[TOLERANCE]] == [100]
-        self.set(TOLERANCE, [200 if is_low else 100])
-        self.wait_for(f'{TOLERANCE} = ')
+        """Move a slider, and wait until the labels have followed."""
+        uuid = self.uuids[TOLERANCE]
+        # What a page sets it is not told.
+        self.values[uuid] = 0.2 if self.values[uuid] == 0.1 else 0.1
+        self.set(TOLERANCE, self.values[uuid])
+        self.wait_for('changed: ')
 
 
 @contextlib.contextmanager

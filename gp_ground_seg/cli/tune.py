@@ -15,7 +15,7 @@ from gp_ground_seg.lab.viewers.html_page import open_server
 from gp_ground_seg.lab.viewers.tuner import Tuner, tunable
 
 DESCRIPTION = """\
-Show a scan in the browser, with sliders and boxes for the parameters. Labels follow at once,
+Show a scan in the browser, with sliders for the parameters. Labels follow at once,
 and points that change their class have a colour. With labels of SemanticKITTI, IoU and objects
 lost are shown too. A button writes the parameters as YAML, and a line tells how to load the file
 into a running node. The page is served to this machine only. Ctrl-C stops it.

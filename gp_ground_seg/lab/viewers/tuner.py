@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -13,7 +14,7 @@ from gp_ground_seg.core.errors import ConfigError, GroundSegError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.log import LOGGER, in_thousands
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec, ParameterValue, load_yaml
+from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec, ParameterValue
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.inputs import Inputs
@@ -21,7 +22,6 @@ from gp_ground_seg.lab.scoring.metrics import Labels
 from gp_ground_seg.lab.viewers.html_page import box, legend, text
 from gp_ground_seg.lab.viewers.scene import point_colours, read_view
 
-N_STEPS = 400  # of a slider
 COLOURS = ('changes', 'class', 'height', 'p_ground', 'errors')
 _USUAL = {'sensor.height': (0.2, 4.0), 'sensor.roll': (-0.3, 0.3), 'sensor.pitch': (-0.3, 0.3)}
 _NO_LABELS = ('frame', 'input', 'output', 'runtime', 'diagnostics')
@@ -32,28 +32,22 @@ def tunable() -> list[ParameterSpec]:
     return [spec for spec in parameter_specs() if spec.name.split('.')[0] not in _NO_LABELS]
 
 
-def slider_values(spec: ParameterSpec, now: ParameterValue) -> list[Any]:
-    """Numbers that the slider of a parameter goes through, `now` among them unless it is `AUTO`.
+def slider_range(spec: ParameterSpec, now: ParameterValue) -> tuple[Any, Any, Any]:
+    """Return least value, greatest value and step of the slider of a parameter.
 
-    They are those that people use, not all that are accepted: a fifth to five times the default.
+    The values are those that people use, not all that are accepted: a fifth to five times the
+    default, and `now`.
     """
-    low, high = spec.minimum, spec.maximum
-    assert low is not None and high is not None
-    if spec.name in _USUAL:
-        low, high = _USUAL[spec.name]
-    elif spec.default != AUTO and float(spec.default) > 0.0:
+    least, greatest = spec.minimum, spec.maximum
+    assert least is not None and greatest is not None
+    low, high = _USUAL.get(spec.name, (least, greatest))
+    if spec.name not in _USUAL and spec.default != AUTO and float(spec.default) > 0.0:
         low, high = max(low, 0.2 * float(spec.default)), min(high, 5.0 * float(spec.default))
-    is_log = low > 0.0 and high >= 10.0 * low
-    steps = (np.geomspace if is_log else np.linspace)(low, high, N_STEPS + 1)
-    numbers = {spec.type(float(f'{step:.3g}')) for step in steps}
-    numbers |= {value for value in (now, spec.default) if value != AUTO}
-    return sorted(value for value in numbers if spec.minimum <= value <= spec.maximum)
-
-
-def _place(values: Sequence[Any], value: ParameterValue) -> tuple[int]:
-    """Position of a slider at the nearest of its values, in the middle for `AUTO`."""
-    number = 0.5 * (values[0] + values[-1]) if value == AUTO else float(value)
-    return (int(np.argmin(np.abs(np.array(values, dtype=float) - number))),)
+    numbers = [low, high, *(float(value) for value in (spec.default, now) if value != AUTO)]
+    low, high = min(numbers), max(numbers)
+    if spec.type is int:
+        return int(low), int(high), 1
+    return low, high, 10.0 ** (math.floor(math.log10(high - low)) - 3)
 
 
 class Tuner:
@@ -85,8 +79,8 @@ class Tuner:
         name = gui.add_dropdown('colours', COLOURS)
         for handle in (number, name):
             handle.on_update(lambda _event: self._changed.set())
-        self._frame = _reader('frame', number, {k: k for k in range(len(inputs))})
-        self._colours = _reader('colours', name, {colours: colours for colours in COLOURS})
+        self._frame = _reader('frame', number, {k: k for k in range(len(inputs))}.__getitem__)
+        self._colours = _reader('colours', name, {word: word for word in COLOURS}.__getitem__)
         self._controls = {name: self._add_control(find_spec(name)) for name in names}
         self.add_button('compare with these values', self._compare)
 
@@ -119,57 +113,32 @@ class Tuner:
         """Add the control of a parameter, and return what reads it."""
         gui, now = self._server.gui, self._start[spec.name]
         hint = f'{spec.description} ({spec.accepted})'
-        if spec.type in (bool, str):
-            words = {str(option).lower(): option for option in spec.choices or (False, True)}
-            shown = gui.add_dropdown(
-                spec.name, list(words), initial_value=str(now).lower(), hint=hint
-            )
-            shown.on_update(lambda _event: self._changed.set())
-            return _reader(spec.name, shown, words)
-        return self._add_number(spec, hint)
+        if spec.type not in (bool, str):
+            return self._add_number(spec, hint)
+        words = {str(option).lower(): option for option in spec.choices or (False, True)}
+        shown = gui.add_dropdown(spec.name, list(words), initial_value=str(now).lower(), hint=hint)
+        shown.on_update(lambda _event: self._changed.set())
+        return _reader(spec.name, shown, words.__getitem__)
 
     def _add_number(self, spec: ParameterSpec, hint: str) -> Callable[[], Any]:
-        """Add a slider and a box that follow each other."""
+        """Add a slider, and a checkbox for `AUTO` where a parameter has that."""
         gui, now = self._server.gui, self._start[spec.name]
+        low, high, step = slider_range(spec, now)
+        number = spec.type(0.5 * (low + high) if now == AUTO else now)
+        title = f'{spec.name} [{spec.unit}]' if spec.unit else spec.name
+        slider = gui.add_slider(title, low, high, step, number, hint=hint, disabled=now == AUTO)
+        slider.on_update(lambda _event: self._changed.set())
+        read = _reader(spec.name, slider, spec.check)
+        if not spec.auto:
+            return read
+        automatic = gui.add_checkbox(f'{spec.name} = {AUTO}', now == AUTO)
 
-        def title(value: ParameterValue) -> str:
-            return f'{spec.name} = {value} {"" if value == AUTO else spec.unit}'.rstrip()
-
-        # A slider of viser goes in even steps: this one over positions in `values`.
-        values, chosen = slider_values(spec, now), now
-        last = len(values) - 1
-
-        slider = gui.add_multi_slider(
-            title(now), 0, last, 1, _place(values, now), hint=hint,
-            marks=((0, str(values[0])), (last, str(values[-1]))),
-        )  # fmt: skip
-        typed = gui.add_text('or type', str(now), hint=hint)
-        read = _reader(spec.name, slider, {(k,): value for k, value in enumerate(values)})
-
-        def take(value: ParameterValue) -> None:
-            nonlocal chosen
-            chosen, slider.label = value, title(value)
+        def switch(_event: Any) -> None:
+            slider.disabled = automatic.value
             self._changed.set()
 
-        def move(event: Any) -> None:
-            if event.client_id is not None:  # else it follows the box
-                take(read())
-                typed.value = str(chosen)
-
-        def read_box(event: Any) -> None:
-            if event.client_id is None:
-                return
-            try:
-                value = spec.check(load_yaml(str(typed.value)))
-            except ConfigError as error:  # also while a number is being typed
-                self._said.content = box(text(error))
-                return
-            slider.value = _place(values, value)
-            take(value)
-
-        slider.on_update(move)
-        typed.on_update(read_box)
-        return lambda: chosen
+        automatic.on_update(switch)
+        return lambda: AUTO if automatic.value else read()
 
     def _segment(self, number: int, config: Config) -> Segmentation:
         self._segmenter.configure(config)
@@ -214,21 +183,21 @@ def _tell(place: Any, action: Callable[[], str]) -> None:
     place.content = box(text(words)) if words else ''
 
 
-def _reader(name: str, control: Any, choices: Mapping[Any, Any]) -> Callable[[], Any]:
-    """Return what reads a control; what the page sent and is no choice is taken back."""
+def _reader(name: str, control: Any, choose: Callable[[Any], Any]) -> Callable[[], Any]:
+    """Return what reads a control; what the page sent and `choose` refuses is taken back."""
     last = control.value
 
     def read() -> Any:
         nonlocal last
         sent = control.value
         try:
-            choice = choices[sent]
-        except (KeyError, TypeError):
+            chosen = choose(sent)
+        except (KeyError, TypeError, ConfigError):
             LOGGER.warning('%s: taken back what the page sent, %.60r', name, sent)
             control.value = last
-            return choices[last]
+            return choose(last)
         last = sent
-        return choice
+        return chosen
 
     return read
 
