@@ -20,7 +20,7 @@ help:
 	@echo 'make docs      the documentation as HTML, in build/docs'
 	@echo 'make node-bench  latency and losses of the node over DDS'
 	@echo 'make colcon    colcon build and colcon test (PYTEST_ARGS=... for some tests)'
-	@echo 'make lint      ruff, mypy and codespell'
+	@echo 'make lint      ruff, mypy, import-linter and codespell'
 	@echo 'make format    format the code'
 	@echo 'make generate  rewrite the tables of README, config/ and docs/parameters.md'
 	@echo 'make clean     remove the environment and build results'
@@ -90,6 +90,7 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 	$(BIN)/codespell
 
 format: $(VENV)/.dev

@@ -31,6 +31,7 @@ DEV = [
     *VISER,
     'cryptography>=42',  # keys of a Dask cluster under test
     'codespell[toml]>=2.3',
+    'import-linter>=2.10',
     'colcon-common-extensions',
     'flake8>=6',
     'flake8-builtins',

@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 from conftest import REPOSITORY
-from test_layout import PACKAGE, ROS, imports, parse
+from test_layout import PACKAGE, parse
 
 import gp_ground_seg
 from gp_ground_seg.core.errors import install_hint
@@ -21,6 +21,23 @@ from gp_ground_seg.ros.start_stop import ROS_WHEELS
 @pytest.fixture
 def package():
     return ElementTree.parse(REPOSITORY / 'package.xml').getroot()
+
+
+ROS = (
+    'rclpy ament_index_python builtin_interfaces diagnostic_msgs geometry_msgs nav_msgs '
+    'rcl_interfaces rosgraph_msgs sensor_msgs sensor_msgs_py std_msgs tf2_ros visualization_msgs'
+)
+
+
+def imports(tree):
+    """Names of the imported modules, with the name imported from each appended."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f'{node.module}.{alias.name}' for alias in node.names)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) == 'require':
+            yield ast.literal_eval(node.args[0])
 
 
 def test_package_xml_is_that_of_this_package(package):
