@@ -24,7 +24,7 @@ def package():
 
 
 ROS = (
-    'rclpy ament_index_python builtin_interfaces diagnostic_msgs geometry_msgs nav_msgs '
+    'rclpy ament_index_python bond builtin_interfaces diagnostic_msgs geometry_msgs nav_msgs '
     'rcl_interfaces rosgraph_msgs sensor_msgs sensor_msgs_py std_msgs tf2_ros visualization_msgs'
 )
 

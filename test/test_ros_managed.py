@@ -1,8 +1,10 @@
 """The managed node, driven by the services that ``ros2 lifecycle`` and Nav2's manager call."""
 
 import contextlib
+import importlib.util
 import signal
 
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
@@ -14,6 +16,7 @@ from ros_helpers import street, to_message, wait_for
 
 from gp_ground_seg.core.backend import choose_backend
 from gp_ground_seg.core.jit import HAVE_NUMBA
+from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.ros.warm_up import FOLLOWS
 
 START = (
@@ -76,6 +79,40 @@ def test_the_transitions_compile_listen_and_free(tmp_path):
         assert end == (True, State.PRIMARY_STATE_FINALIZED)
         assert process.stop(signal.SIGINT)[0] == 0
         assert 'Traceback' not in process.log and 'ERROR' not in process.log
+
+
+def test_a_lifecycle_manager_hears_a_bond_while_the_node_is_active(tmp_path):
+    status = pytest.importorskip('bond.msg', reason='package bond is not installed').Status
+    with managed_node(tmp_path) as (process, link):
+        heard, instances = ros.Collector(link.probe, status, 'bond'), []
+        change(link, Transition.TRANSITION_CONFIGURE)
+        assert not heard.messages
+        for n in (1, 2):
+            heard.messages.clear()
+            change(link, Transition.TRANSITION_ACTIVATE)
+            wait_for(lambda: len(heard.messages) > 2, 'three heartbeats')
+            change(link, Transition.TRANSITION_DEACTIVATE)
+            wait_for(lambda: not heard.messages[-1].active, 'end of the bond')
+            *beats, end = heard.messages
+            assert all(beat.active for beat in beats), n
+            assert {one.id for one in heard.messages} == {NODE_NAME}
+            instances.append({one.instance_id for one in heard.messages})
+            times = [one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec for one in beats]
+            assert np.diff(times) == pytest.approx(1.0, abs=0.5)
+            assert end.heartbeat_period == 1.0 and end.heartbeat_timeout == 4.0
+        (first,), (second,) = instances
+        assert first != second
+        assert process.stop(signal.SIGINT)[0] == 0
+        assert 'Traceback' not in process.log and 'bond_timeout' not in process.log
+
+
+def test_without_the_message_the_node_says_what_to_set(tmp_path):
+    if importlib.util.find_spec('bond') is not None:
+        pytest.skip('package bond is installed')
+    with managed_node(tmp_path) as (process, link):
+        change(link, Transition.TRANSITION_CONFIGURE)
+        change(link, Transition.TRANSITION_ACTIVATE)
+        process.wait_until_ready('set bond_timeout: 0.0')
 
 
 @pytest.mark.slow

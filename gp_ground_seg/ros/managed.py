@@ -10,18 +10,21 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.ros import node
+from gp_ground_seg.ros.heartbeat import NO_BOND, Heartbeat, find_message
 from gp_ground_seg.ros.start_stop import StopRequest
 
 
 class ManagedNode(LifecycleNodeMixin, node.GroundSegmentationNode):  # type: ignore[misc]
     """A `GroundSegmentationNode` that is told when to begin, by the transitions of ROS.
 
-    *configure* makes the compiled backend and waits for it; *activate* subscribes; *deactivate*
-    ends the subscription; *cleanup*, *shutdown* and an error free the backend. Parameters can be
-    set in every state. Options are those of `rclpy.node.Node`.
+    *configure* makes the compiled backend and waits for it; *activate* subscribes, and begins the
+    bond that Nav2's lifecycle manager waits for; *deactivate* ends both; *cleanup*, *shutdown* and
+    an error free the backend. Parameters can be set in every state. Options are those of
+    `rclpy.node.Node`.
     """
 
     _is_configured = _is_active = False
+    _heartbeat: Heartbeat | None = None
 
     def __init__(self, stop: StopRequest, **options: Any) -> None:
         self._stop = stop
@@ -49,6 +52,13 @@ class ManagedNode(LifecycleNodeMixin, node.GroundSegmentationNode):  # type: ign
     def _set_active(self, is_active: bool) -> TransitionCallbackReturn:
         self._is_active = is_active
         self._input.review()
+        if self._heartbeat is not None:
+            self._heartbeat.stop()
+            self._heartbeat = None
+        if is_active and (message := find_message()) is not None:
+            self._heartbeat = Heartbeat(self, message)
+        elif is_active:
+            self.get_logger().info(NO_BOND)
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
