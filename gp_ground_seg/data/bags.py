@@ -1,37 +1,40 @@
 """Bags: ROS 1, rosbag2 folders, MCAP and sqlite3 files read; rosbag2 written whole or not at all.
 
-The one module that imports rosbags, an optional package; only where a bag is used.
+The one module that imports rosbags, mcap and zstandard, optional packages; only where a bag is
+used. Why not rosbags for MCAP and rosbag2 folders: one channel of protobuf or JSON, one line of
+metadata.yaml that is not needed, or no profile stops it (test/foreign_files.py).
 """
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import os
+import sqlite3
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from contextlib import AbstractContextManager, ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack, closing
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
-from gp_ground_seg.core.errors import DataError, in_one_line, require
+from gp_ground_seg.core.errors import DataError, require
 from gp_ground_seg.data.atomic_output import staged_bag_folder, staged_file
 from gp_ground_seg.data.bag_files import (
     METADATA_FILE,
+    PACKED_SUFFIXES,
     POINT_CLOUD2,
     STORAGE_OF_SUFFIX,
     SUFFIX_OF_STORAGE,
-    UNKNOWN_TYPE_HASH,
     BagTopic,
     check_is_bag,
+    check_mcap_file,
+    check_sqlite_file,
+    list_files,
     reading,
     resolve_storage,
     storage_of,
     writing,
 )
-
-_HEADER = 'std_msgs/msg/Header'
-_RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
 
 
 @functools.cache
@@ -43,109 +46,187 @@ def jazzy_types() -> Any:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-def jazzy_topic(name: str, msgtype: str) -> BagTopic:
+def jazzy_topic(name: str, msgtype: str, qos: tuple[Any, ...] = ()) -> BagTopic:
     """Topic of a type that is part of ROS 2 Jazzy."""
-    return _topic_of(jazzy_types(), name, msgtype, ())
+    definition, _ = jazzy_types().generate_msgdef(msgtype, ros_version=2)
+    return BagTopic(name, msgtype, definition, jazzy_types().hash_rihs01(msgtype), qos)
 
 
 def cloud_topic(name: str) -> BagTopic:
     """PointCloud2 topic offered reliably; with best effort, large clouds get lost when played."""
-    return _topic_of(jazzy_types(), name, POINT_CLOUD2, (_reliable_qos('VOLATILE'),))
-
-
-def _topic_of(types: Any, name: str, msgtype: str, qos: tuple[Any, ...]) -> BagTopic:
-    definition, _ = types.generate_msgdef(msgtype, ros_version=2)
-    return BagTopic(name, msgtype, definition, types.hash_rihs01(msgtype), qos=qos)
-
-
-def _reliable_qos(durability: str) -> Any:
+    require('rosbags.highlevel', 'rosbags')
     from rosbags import interfaces as ros
 
     forever = ros.QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
     history, liveliness = ros.QosHistory.KEEP_LAST, ros.QosLiveliness.AUTOMATIC
-    kind = ros.QosReliability.RELIABLE, ros.QosDurability[durability]
-    return ros.Qos(history, 10, *kind, forever, forever, liveliness, forever, False)
+    kind = ros.QosReliability.RELIABLE, ros.QosDurability.VOLATILE
+    qos = ros.Qos(history, 10, *kind, forever, forever, liveliness, forever, False)
+    return jazzy_topic(name, POINT_CLOUD2, (qos,))
 
 
-@functools.cache
-def _parse_definition(text: str, msgtype: str) -> Any:
-    """Types of one definition (.msg or .idl text) in a separate store, only to be read."""
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+class _Channel(NamedTuple):
+    """Messages of one topic, type and encoding in one file; `key` is its number there."""
 
-    store = get_typestore(Stores.EMPTY)
-    separator = 80 * '=' + '\n'
-    if text.startswith(f'{separator}IDL: '):
-        parts = (part.partition('\n')[2] for part in text.split(separator)[1:])
-        types = {name: kind for part in parts for name, kind in get_types_from_idl(part).items()}
-    else:
-        types = get_types_from_msg(text, msgtype)
-    store.register(types)
-    return store
+    key: int
+    topic: str
+    msgtype: str
+    encoding: str
+    n_messages: int
 
 
-def _ros2_topic(connection: Any) -> BagTopic:
-    """Topic of a rosbag2 connection; older bags have neither definition nor hash."""
-    msgtype, text = connection.msgtype, connection.msgdef.data
-    type_hash = connection.digest if text else ''
-    if not text and msgtype in jazzy_types().fielddefs:
-        known = jazzy_topic(connection.topic, msgtype)
-        text, type_hash = known.definition, known.type_hash
-    elif text and not type_hash:
-        with suppress(Exception):  # A definition rosbags cannot parse is copied all the same.
-            type_hash = _parse_definition(text, msgtype).hash_rihs01(msgtype)
-    encoding, qos = connection.ext
-    known_hash = type_hash or UNKNOWN_TYPE_HASH
-    return BagTopic(connection.topic, msgtype, text, known_hash, encoding, tuple(qos))
+class _Storage(Protocol):
+    """One file of a bag."""
+
+    channels: list[_Channel]
+
+    def messages(self, keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        """Key, recorded time [ns] and bytes of each message of these channels."""
 
 
-def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
-    """Topic of a ROS 1 connection, and a function that converts its messages to CDR."""
-    from rosbags.convert.converter import is_same_wireformat, migrate_bytes
-    from rosbags.typesys import Stores, get_typestore
+class _Ros1Storage:
+    """A ``.bag``. Its clouds become CDR, which other messages are not."""
 
-    old = connection.msgtype
-    new = _RENAMED.get(old, old)
-    source, target = _parse_definition(connection.msgdef.data, old), jazzy_types()
-    if new not in target.fielddefs:
-        header = target.fielddefs[_HEADER]
-        target = get_typestore(Stores.EMPTY)
-        target.register({**source.fielddefs, _HEADER: header})
-    convert: Callable[[bytes], Any] = functools.partial(target.ros1_to_cdr, typename=new)
-    # In the same layout only a header's ``seq`` goes; else fields of one name keep their value.
-    if not is_same_wireformat(source, target, old, new):
-        convert = functools.partial(
-            migrate_bytes, source, target, old, new, {}, src_is2=False, dst_is2=True
+    def __init__(self, path: Path, stack: ExitStack) -> None:
+        require('rosbags.highlevel', 'rosbags')
+        from rosbags import rosbag1
+
+        self._reader = rosbag1.Reader(path)
+        self._reader.open()
+        stack.callback(self._reader.close)
+        self.channels = [
+            _Channel(c.id, c.topic, c.msgtype, self._encoding(c.msgtype), c.msgcount)
+            for c in self._reader.connections
+        ]
+
+    @staticmethod
+    def _encoding(msgtype: str) -> str:
+        return 'cdr' if msgtype == POINT_CLOUD2 else 'ros1'
+
+    def messages(self, keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        connections = [c for c in self._reader.connections if c.id in keys]
+        for connection, time, raw in self._reader.messages(connections):
+            yield connection.id, time, jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2)
+
+
+class _SqliteStorage:
+    """A ``.db3`` of any version of rosbag2."""
+
+    def __init__(self, path: Path, stack: ExitStack) -> None:
+        check_sqlite_file(path)
+        address = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
+        database = sqlite3.connect(address, uri=True, check_same_thread=False)
+        self._database = stack.enter_context(closing(database))
+        counts = dict(
+            database.execute('SELECT topic_id, count(*) FROM messages GROUP BY topic_id')
         )
-    qos = (_reliable_qos('TRANSIENT_LOCAL'),) if connection.ext.latching else ()
-    return _topic_of(target, connection.topic, new, qos), convert
+        topics = database.execute('SELECT id, name, type, serialization_format FROM topics')
+        self.channels = [_Channel(key, *about, counts.get(key, 0)) for key, *about in topics]
+
+    def messages(self, keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        wanted = ', '.join(map(str, map(int, keys)))
+        yield from self._database.execute(
+            'SELECT topic_id, timestamp, data FROM messages '
+            f'WHERE topic_id IN ({wanted}) ORDER BY timestamp, id'
+        )
+
+
+class _McapStorage:
+    """An ``.mcap``. Without an index of its chunks it is read in the order of the file."""
+
+    def __init__(self, path: Path, stack: ExitStack) -> None:
+        reader = require('mcap.reader', 'mcap')
+        check_mcap_file(path)
+        self._file = stack.enter_context(path.open('rb'))
+        self._reader = reader.SeekingReader(self._file, validate_crcs=True)
+        summary = self._reader.get_summary()
+        self._is_indexed = bool(summary and summary.chunk_indexes)
+        channels: dict[int, Any] = {}
+        schemas: dict[int, Any] = {}
+        counts: dict[int, int] = {}
+        indexed: set[int] = set()
+        if summary is not None:
+            channels, schemas = summary.channels, summary.schemas
+            counts = summary.statistics.channel_message_counts if summary.statistics else {}
+            indexed = {key for c in summary.chunk_indexes for key in c.message_index_offsets}
+        if not counts or not {*counts, *indexed} <= channels.keys():
+            counts = self._scan(channels, schemas)
+        self.channels = [
+            _Channel(
+                c.id,
+                c.topic,
+                schemas[c.schema_id].name if c.schema_id else '',
+                c.message_encoding,
+                counts.get(c.id, 0),
+            )
+            for c in channels.values()
+        ]
+
+    def _scan(self, channels: dict[int, Any], schemas: dict[int, Any]) -> Counter[int]:
+        """Count the messages of a file whose summary does not; completes its channels."""
+        from mcap.records import Channel, Message, Schema
+        from mcap.stream_reader import StreamReader
+
+        counts: Counter[int] = Counter()
+        self._file.seek(0)
+        for record in StreamReader(self._file, validate_crcs=True).records:
+            if isinstance(record, Message):
+                counts[record.channel_id] += 1
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Schema):
+                schemas[record.id] = record
+        return counts
+
+    def messages(self, keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        topics = {c.topic for c in self.channels if c.key in keys}
+        found = self._reader.iter_messages(topics, log_time_order=self._is_indexed)
+        for _, channel, message in found:
+            if channel.id in keys:
+                yield channel.id, message.log_time, message.data
+
+
+_STORAGES: dict[str, Callable[[Path, ExitStack], _Storage]] = {
+    '.bag': _Ros1Storage,
+    '.db3': _SqliteStorage,
+    '.mcap': _McapStorage,
+}
+
+
+def _open_storage(file: Path, stack: ExitStack) -> _Storage:
+    """Open one file of a bag; a packed one is unpacked first."""
+    if file.suffix not in PACKED_SUFFIXES:
+        return _STORAGES[file.suffix](file, stack)
+    plain = Path(stack.enter_context(tempfile.TemporaryDirectory()), file.stem)
+    with file.open('rb') as source, plain.open('wb') as target:
+        require('zstandard', 'zstandard').ZstdDecompressor().copy_stream(source, target)
+    return _STORAGES[plain.suffix](plain, stack)
 
 
 class BagReader(AbstractContextManager['BagReader']):
     """A bag as ROS 2 topics with CDR messages, to be used in a ``with`` statement.
 
-    `path` is a ROS 1 ``.bag``, whose messages are converted, a rosbag2 folder, ``.mcap`` or
-    ``.db3``. Raises DataError if it cannot be read, MissingDependencyError without rosbags.
+    `path` is a ROS 1 ``.bag``, whose clouds are converted, a rosbag2 folder, ``.mcap`` or
+    ``.db3``. Topics of other encodings are listed, and not read. Raises DataError if it cannot be
+    read, MissingDependencyError without rosbags and mcap.
     """
 
     def __init__(self, path: str | Path) -> None:
-        require('rosbags.highlevel', 'rosbags')
-        from rosbags import rosbag1, rosbag2
-
+        require('rosbags.highlevel', 'rosbags mcap')
         self.path = Path(path)
         self.storage = storage_of(self.path)  # ``ros1``, ``mcap`` or ``sqlite3``
-        self._converters: dict[int, Callable[[bytes], Any]] = {}
         with ExitStack() as stack:
             with reading(self.path):
                 check_is_bag(self.path)
-                rosbag: Any = rosbag1 if self.storage == 'ros1' else rosbag2
-                reader = rosbag.Reader(self.path)
-                reader.open()
-                stack.callback(reader.close)
-            self._reader = reader
-            self._topics: dict[str, BagTopic] = {}
-            for connection in reader.connections:
-                self._add(self._describe(connection), connection.msgcount)
+                files, self._counts, self._is_packed = list_files(self.path)
+                self._storages = [_open_storage(file, stack) for file in files]
             self._open = stack.pop_all()
+        self._topics: dict[str, list[_Channel]] = {}
+        channels = [channel for storage in self._storages for channel in storage.channels]
+        # What is recorded on a topic beside CDR is left.
+        for channel in sorted(channels, key=lambda c: c.encoding != 'cdr'):
+            known = self._topics.setdefault(channel.topic, [])
+            if channel.encoding == (known or [channel])[0].encoding:
+                known.append(channel)
 
     def __exit__(self, *error: object) -> None:
         """Close the files; nothing can be read afterwards."""
@@ -153,36 +234,38 @@ class BagReader(AbstractContextManager['BagReader']):
 
     @property
     def topics(self) -> dict[str, str]:
-        """Message type of each topic, as in ``sensor_msgs/msg/PointCloud2``."""
-        return {name: topic.msgtype for name, topic in self._topics.items()}
+        """Type of the messages of each topic; those not in CDR with their encoding."""
+        return {name: self._kind(name) for name in self._topics}
+
+    def _kind(self, topic: str) -> str:
+        channels = self._topics[topic]
+        types = ' and '.join(sorted({channel.msgtype for channel in channels}))
+        encoding = channels[0].encoding
+        return types if encoding == 'cdr' else ', '.join(filter(None, (types, encoding)))
 
     @property
     def point_cloud_topics(self) -> list[str]:
         """Names of the PointCloud2 topics."""
-        kind = POINT_CLOUD2, 'cdr'
-        return [name for name, t in self._topics.items() if (t.msgtype, t.encoding) == kind]
-
-    def topic(self, name: str) -> BagTopic:
-        """Return the description of a topic; raises DataError if there is none of that name."""
-        if name not in self._topics:
-            raise DataError(f'{self.path}: no topic {name}; topics here: {self._list_topics()}')
-        return self._topics[name]
+        return [name for name, kind in self.topics.items() if kind == POINT_CLOUD2]
 
     def _list_topics(self) -> str:
         return ', '.join(f'{name} ({kind})' for name, kind in self.topics.items()) or 'none'
 
     def n_messages(self, topic: str) -> int:
-        """Messages of one topic; raises as `topic` does."""
-        return self.topic(topic).n_messages
+        """Messages of one topic; raises DataError if there is none of that name."""
+        if topic not in self._topics:
+            raise DataError(f'{self.path}: no topic {topic}; topics here: {self._list_topics()}')
+        return self._counts.get(topic, sum(c.n_messages for c in self._topics[topic]))
 
     def pick_point_cloud_topic(self, topic: str | None = None) -> str:
         """Return `topic` if it has point clouds, or the only one that has; else a DataError."""
         clouds = self.point_cloud_topics
         if topic is not None:
-            if (msgtype := self.topic(topic).msgtype) != POINT_CLOUD2:
+            self.n_messages(topic)
+            if topic not in clouds:
                 raise DataError(
-                    f'{self.path}: topic {topic} is of type {msgtype}, must be {POINT_CLOUD2}; '
-                    f'such topics here: {", ".join(clouds) or "none"}'
+                    f'{self.path}: topic {topic} is of type {self._kind(topic)}, must be '
+                    f'{POINT_CLOUD2}; such topics here: {", ".join(clouds) or "none"}'
                 )
             clouds = [topic]
         recorded = [name for name in clouds if self.n_messages(name)]
@@ -198,62 +281,57 @@ class BagReader(AbstractContextManager['BagReader']):
         raise DataError(f'{self.path}: {problem}')
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, recorded time [ns] and CDR bytes of each message, of all topics by default.
+        """Topic, recorded time [ns] and CDR bytes of each message, by default of all in CDR.
 
         In order of their time; file after file in a split bag. Raises DataError if a topic is
-        unknown, the bag damaged, or its list of messages wrong.
+        unknown, of several types or not in CDR, the bag damaged, or its list of messages wrong.
         """
-        wanted = {name: self.topic(name) for name in (self._topics if topics is None else topics)}
-        for name, topic in wanted.items():
-            if topic.problem:
+        expected = {name: self.n_messages(name) for name in topics or ()}
+        if topics is None:
+            readable = [name for name, channels in self._topics.items() if _is_readable(channels)]
+            expected = {name: self.n_messages(name) for name in readable}
+        for name in expected:
+            if not _is_readable(self._topics[name]):
                 raise DataError(
-                    f'{self.path}: topic {name} ({topic.msgtype}) has a message definition '
-                    f'that cannot be converted from ROS 1: {topic.problem}'
+                    f'{self.path}: topic {name} has messages of {self._kind(name)}; '
+                    'one topic must have one type, and be in CDR'
                 )
-        connections = [c for c in self._reader.connections if c.topic in wanted]
         found: Counter[str] = Counter()
-        source = iter(self._reader.messages(connections=connections) if connections else ())
-        while True:
-            # Errors of the caller, raised at the yield, must not pass through here.
-            with reading(self.path):
-                if (entry := next(source, None)) is None:
-                    break
-                connection, time, raw = entry
-                message = bytes(self._converters.get(connection.id, bytes)(raw))
-            found[connection.topic] += 1
-            yield connection.topic, time, message
-        for name, topic in wanted.items():
-            if found[name] != topic.n_messages:
+        for storage in self._storages:
+            names = {
+                c.key: c.topic
+                for c in storage.channels
+                if c.topic in expected and c.encoding == 'cdr'
+            }
+            for key, time, raw in self._read(storage, names):
+                found[names[key]] += 1
+                yield names[key], time, raw
+        for name, n_messages in expected.items():
+            if found[name] != n_messages:
                 raise DataError(
-                    f'{self.path}: topic {name} lists {topic.n_messages} messages, '
+                    f'{self.path}: topic {name} lists {n_messages} messages, '
                     f'{found[name]} could be read; the bag is damaged, '
                     f'or its {METADATA_FILE} belongs to another one'
                 )
 
-    def _add(self, topic: BagTopic, n_messages: int) -> None:
-        """Add a topic, or another of its publishers."""
-        known = self._topics.setdefault(topic.name, topic)
-        if known.msgtype != topic.msgtype:
-            raise DataError(
-                f'{self.path}: topic {topic.name} has messages of two types, {known.msgtype} and '
-                f'{topic.msgtype}; one topic must have one type'
-            )
-        self._topics[topic.name] = dataclasses.replace(
-            known,
-            n_messages=known.n_messages + n_messages,
-            qos=tuple(dict.fromkeys((*known.qos, *topic.qos))),
-            problem=known.problem or topic.problem,
-        )
+    def _read(self, storage: _Storage, keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        """Messages of one file, unpacked; errors of reading as DataError."""
+        source = storage.messages(keys) if keys else iter(())
+        while True:
+            # Errors of the caller, raised at the yield, must not pass through here.
+            with reading(self.path):
+                if (entry := next(source, None)) is None:
+                    return
+                key, time, raw = entry
+                if self._is_packed:
+                    unpacker = require('zstandard', 'zstandard').ZstdDecompressor()
+                    raw = unpacker.decompressobj().decompress(raw)
+            yield key, time, bytes(raw)
 
-    def _describe(self, connection: Any) -> BagTopic:
-        if self.storage != 'ros1':
-            return _ros2_topic(connection)
-        try:
-            topic, self._converters[connection.id] = _ros1_topic(connection)
-        except Exception as error:  # Reported when, and only if, the topic is read.
-            name, msgtype, problem = connection.topic, connection.msgtype, in_one_line(error)
-            return BagTopic(name, msgtype, '', UNKNOWN_TYPE_HASH, problem=problem)
-        return topic
+
+def _is_readable(channels: Collection[_Channel]) -> bool:
+    """Whether the messages of a topic are of one type in CDR."""
+    return {c.encoding for c in channels} == {'cdr'} and len({c.msgtype for c in channels}) == 1
 
 
 class BagWriter:
@@ -307,7 +385,6 @@ class BagWriter:
                 topic.msgtype,
                 msgdef=topic.definition,
                 rihs01=topic.type_hash,
-                serialization_format=topic.encoding,
                 offered_qos_profiles=topic.qos,
             )
 

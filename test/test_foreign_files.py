@@ -1,0 +1,45 @@
+"""One unneeded part does not stop the reading: every file of the table, and what is read of it."""
+
+import re
+
+import numpy as np
+import pytest
+from foreign_files import CASES, XYZ
+
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.data.bags import BagReader
+from gp_ground_seg.data.cloud_files import decode_file
+from gp_ground_seg.data.inputs import list_inputs
+
+pytest.importorskip('lzf', reason='needs the extra formats')
+
+
+def what_is_read(path):
+    """Names of the fields, topic and number of clouds, or the line of the error."""
+    try:
+        if path.suffix not in ('.pcd', '.ply'):
+            inputs = list_inputs(path)
+            for one in inputs:
+                np.testing.assert_array_equal(one.read().xyz, XYZ)
+            with BagReader(path) as bag:
+                return f'{inputs.topic} {sum(1 for _ in bag.messages([inputs.topic]))}'
+        cloud = decode_file(path, path.read_bytes())
+        np.testing.assert_array_equal(cloud.xyz, XYZ)
+        return ' '.join(cloud.fields.dtype.names)
+    except DataError as error:
+        return str(error)
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('name', CASES)
+def test_what_is_needed_is_read_of_every_file(tmp_path, name):
+    content, expected = CASES[name]
+    path = tmp_path / name
+    if callable(content):
+        content(path)
+    else:
+        path.write_bytes(content)
+    found = what_is_read(path)
+    if found != expected:
+        assert str(path) in found and '\n' not in found
+        assert re.search(expected, found)
