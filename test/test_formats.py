@@ -114,6 +114,38 @@ def test_what_a_format_beside_its_points_says_is_kept(tmp_path):
         np.testing.assert_array_equal(found['pose'], np.eye(4))
 
 
+NAMES = (
+    'a b', 'a_b', 'a  b', 'a_b_2', 'a', 'a_0', 'a 1', 'label', 'gp_label', '_', ' ', 'field', 'X',
+    'höhe', '高さ', 'points', 'file', 'allow_pickle', 'self',
+)  # fmt: skip
+
+
+@pytest.mark.parametrize('suffix', WRITABLE)
+def test_no_column_is_lost_when_written(tmp_path, suffix):
+    columns = {name: np.full(3, k, 'u2') for k, name in enumerate(NAMES)}
+    columns['a'] = np.arange(100, 106, dtype='u2').reshape(3, 2)
+    fields = gather({**{name: np.arange(3, dtype='f4') for name in 'xyz'}, **columns})
+    path = tmp_path / f'a{suffix}'
+    found = reread(path, encode(path, fields, label=np.full(3, 77, 'u1'))).fields
+    values = [v for name in found.dtype.names[3:] for v in np.ravel(found[name])]
+    expected = [77] * 3 + [v for column in columns.values() for v in column.ravel()]
+    assert sorted(values) == sorted(expected)
+    # A name that can be kept is; nothing else takes it.
+    for name in ('a_b', 'a_b_2', 'a_0', 'label', 'gp_label', 'field', 'X', 'höhe', '高さ'):
+        np.testing.assert_array_equal(found[name], columns[name])
+    np.testing.assert_array_equal(found['gp_gp_label'], 77)
+
+
+def test_long_integers_in_a_ply_keep_their_value_or_are_refused(tmp_path):
+    path = tmp_path / 'a.ply'
+    xyz = {name: np.zeros(2, 'f4') for name in 'xyz'}
+    for kind in ('i8', 'u8'):
+        found = reread(path, encode(path, gather({**xyz, 't': np.array([5, 2**53 - 1], kind)})))
+        np.testing.assert_array_equal(found.fields['t'], [5, 2**53 - 1])
+        with pytest.raises(DataError, match='field t: PLY has no type'):
+            encode(path, gather({**xyz, 't': np.array([5, 2**53 + 1], kind)}))
+
+
 # Files of other writers.
 
 
@@ -235,6 +267,11 @@ def test_what_other_programs_write_is_read(tmp_path, name):
 
 
 def test_arrays_of_every_kind(tmp_path):
+    xyz = dict(zip('XYZ', np.arange(9.0).reshape(3, 3), strict=True))
+    np.savez(tmp_path / 'fields.npz', **xyz, points=np.arange(3), pose=np.eye(4))
+    np.save(tmp_path / 'fields.npy', gather(xyz))
+    for name in ('fields.npy', 'fields.npz'):
+        np.testing.assert_array_equal(read_file(tmp_path / name).xyz.T, list(xyz.values()))
     table = np.random.default_rng(1).normal(size=(9, 5))
     np.save(tmp_path / 'table.npy', np.asfortranarray(table))
     np.savez_compressed(tmp_path / 'table.npz', points=table, ring=np.arange(9))
@@ -355,7 +392,7 @@ LIES = {
         'property x of the vertices: is a list',
     ),
     'many.ply': (FOREIGN['pcl.ply'][0].replace(b'vertex 4', b'vertex 4000000'), '4000000 points'),
-    'faces.ply': (ply(['format ascii 1.0', 'element face 0'], b''), 'must begin with the vert'),
+    'faces.ply': (ply(['format ascii 1.0', 'element face 0'], b''), 'no vertices of a PLY in it'),
 }  # fmt: skip
 
 

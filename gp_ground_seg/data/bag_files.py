@@ -112,17 +112,20 @@ def list_files(path: Path) -> tuple[list[Path], dict[str, int], bool]:
 def check_mcap_file(path: Path) -> None:
     """Raise ValueError where an MCAP file has no end, or is of ROS 1."""
     with path.open('rb') as file:
-        start = file.read(100)
-        file.seek(-min(len(start), len(_MCAP_MAGIC)), os.SEEK_END)
+        start = file.read(25)
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - len(_MCAP_MAGIC), 0))
         end = file.read()
     if not start.startswith(_MCAP_MAGIC):
         raise ValueError('no MCAP' if start else 'empty')
-    if end != _MCAP_MAGIC or len(start) < 2 * len(_MCAP_MAGIC):
+    if end != _MCAP_MAGIC or len(start) < 25:
         raise ValueError(
             'truncated, or still being recorded; `mcap recover` saves the readable part'
         )
-    # Behind the kind of the header, its size and that of the name.
-    if start[21:].startswith(b'ros1'):
+    kind, n_bytes, _, profile = struct.unpack_from('<BQI4s', start, len(_MCAP_MAGIC))
+    if kind != 1 or n_bytes > size:
+        raise ValueError(f'its first record is of kind {kind} and {n_bytes} bytes, of {size}')
+    if profile == b'ros1':
         raise ValueError(
             'its messages are of ROS 1; give the .bag that it was made from, or write a rosbag2 '
             'from that: `rosbags-convert --src IN.bag --dst OUT`'

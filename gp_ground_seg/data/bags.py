@@ -116,11 +116,12 @@ class _SqliteStorage:
         address = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
         database = sqlite3.connect(address, uri=True, check_same_thread=False)
         self._database = stack.enter_context(closing(database))
-        counts = dict(
-            database.execute('SELECT topic_id, count(*) FROM messages GROUP BY topic_id')
-        )
+        counts = dict(database.execute('SELECT topic_id, count(*) FROM messages GROUP BY 1'))
         topics = database.execute('SELECT id, name, type, serialization_format FROM topics')
-        self.channels = [_Channel(key, *about, counts.get(key, 0)) for key, *about in topics]
+        self.channels = [
+            _Channel(key, name, msgtype, encoding, counts.get(key, 0))
+            for key, name, msgtype, encoding in topics
+        ]
 
     def messages(self, keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
         wanted = ', '.join(map(str, map(int, keys)))
