@@ -17,7 +17,7 @@ from rosbags.interfaces import QosReliability
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.atomic_output import leftovers, staged_files
 from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag, is_bag_folder, resolve_storage
-from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic, jazzy_topic
+from gp_ground_seg.data.bags import BagReader, BagWriter
 from gp_ground_seg.data.point_cloud2 import encode_cloud
 
 SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive.db3', None)]
@@ -213,7 +213,7 @@ def test_a_bag_is_replaced_with_force_only_and_by_a_whole_one_only(tmp_path, nam
 
     def fail_in_the_middle(force):
         with BagWriter(path, storage=storage, force=force) as bag:
-            bag.add_topic(cloud_topic('/points'))
+            bag.add_topic('/points')
             bag.write('/points', 5, encode_cloud(samples.cloud()))
             assert leftovers(path)
             raise ZeroDivisionError
@@ -230,7 +230,7 @@ def test_a_bag_is_replaced_with_force_only_and_by_a_whole_one_only(tmp_path, nam
     assert listing(tmp_path) == files
     assert not leftovers(path)
     with BagWriter(path, storage=storage, force=True) as bag:
-        bag.add_topic(jazzy_topic('/note', 'std_msgs/msg/String'))
+        bag.add_topic('/note', 'std_msgs/msg/String')
         bag.write('/note', 1, samples.string_message('new'))
         # Until the new one is complete, the old one is there.
         assert read_all(path) == before
@@ -310,10 +310,10 @@ def test_unusual_names_work(tmp_path, small_bags, name):
 
 def test_a_topic_is_declared_once_and_has_one_type(tmp_path):
     with BagWriter(tmp_path / 'x.mcap') as bag:
-        bag.add_topic(cloud_topic('/same'))
+        bag.add_topic('/same')
         with pytest.raises(DataError, match='topic /same twice'):
-            bag.add_topic(cloud_topic('/same'))
-        bag.add_topic(jazzy_topic('/diff', 'std_msgs/msg/String'))
+            bag.add_topic('/same')
+        bag.add_topic('/diff', 'std_msgs/msg/String')
         bag.write('/same', 1, encode_cloud(samples.cloud(n_ground=1, n_wall=1)))
         bag.write('/diff', 2, samples.string_message('x'))
     content = (tmp_path / 'x.mcap').read_bytes()

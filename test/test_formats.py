@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.data.bags import BagWriter, cloud_topic
+from gp_ground_seg.data.bags import BagWriter
 from gp_ground_seg.data.cloud_files import WRITABLE, decode_file, encode_file, read_file
 from gp_ground_seg.data.clouds import cloud_of, gather, name_columns
 from gp_ground_seg.data.pcd import PcdHeader
@@ -404,7 +404,7 @@ def bag_of(suffix, **changes):
         for name, value in changes.items():
             setattr(points, name, value)
         with BagWriter(path) as bag:
-            bag.add_topic(cloud_topic('/points'))
+            bag.add_topic('/points')
             bag.write('/points', 0, encode_cloud(points))
         return path.read_bytes()
 

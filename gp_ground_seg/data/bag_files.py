@@ -8,9 +8,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any
 
 import yaml
 
@@ -33,17 +31,6 @@ _NEXT_STEP = {
     'index looks damaged': 'truncated? `rosbag reindex` saves the readable part',
     'malformed': 'truncated or overwritten? `sqlite3 .recover` saves the readable part',
 }
-
-
-@dataclass(frozen=True)
-class BagTopic:
-    """A topic to be written, in ROS 2 terms."""
-
-    name: str
-    msgtype: str  # as in ``sensor_msgs/msg/PointCloud2``
-    definition: str  # text of the message definition
-    type_hash: str  # RIHS01
-    qos: tuple[Any, ...] = ()  # offered by the publishers (``rosbags.interfaces.Qos``)
 
 
 def is_bag(path: str | Path) -> bool:

@@ -1,8 +1,8 @@
 """Bags: ROS 1, rosbag2 folders, MCAP and sqlite3 files read; rosbag2 written whole or not at all.
 
 The one module that imports rosbags, mcap and zstandard, optional packages; only where a bag is
-used. Why not rosbags for MCAP and rosbag2 folders: one channel of protobuf or JSON, one line of
-metadata.yaml that is not needed, or no profile stops it (test/foreign_files.py).
+used. Why not rosbags for MCAP and rosbag2 folders: a channel of protobuf or JSON, no profile, or
+one line of metadata.yaml that is not needed stop it (test/foreign_files.py).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, ExitStack, closing
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from gp_ground_seg.core.errors import DataError, require
 from gp_ground_seg.data.atomic_output import staged_bag_folder, staged_file
@@ -25,7 +25,6 @@ from gp_ground_seg.data.bag_files import (
     POINT_CLOUD2,
     STORAGE_OF_SUFFIX,
     SUFFIX_OF_STORAGE,
-    BagTopic,
     check_is_bag,
     check_mcap_file,
     check_sqlite_file,
@@ -46,24 +45,6 @@ def jazzy_types() -> Any:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-def jazzy_topic(name: str, msgtype: str, qos: tuple[Any, ...] = ()) -> BagTopic:
-    """Topic of a type that is part of ROS 2 Jazzy."""
-    definition, _ = jazzy_types().generate_msgdef(msgtype, ros_version=2)
-    return BagTopic(name, msgtype, definition, jazzy_types().hash_rihs01(msgtype), qos)
-
-
-def cloud_topic(name: str) -> BagTopic:
-    """PointCloud2 topic offered reliably; with best effort, large clouds get lost when played."""
-    require('rosbags.highlevel', 'rosbags')
-    from rosbags import interfaces as ros
-
-    forever = ros.QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
-    history, liveliness = ros.QosHistory.KEEP_LAST, ros.QosLiveliness.AUTOMATIC
-    kind = ros.QosReliability.RELIABLE, ros.QosDurability.VOLATILE
-    qos = ros.Qos(history, 10, *kind, forever, forever, liveliness, forever, False)
-    return jazzy_topic(name, POINT_CLOUD2, (qos,))
-
-
 class _Channel(NamedTuple):
     """Messages of one topic, type and encoding in one file; `key` is its number there."""
 
@@ -74,133 +55,106 @@ class _Channel(NamedTuple):
     n_messages: int
 
 
-class _Storage(Protocol):
-    """One file of a bag."""
-
-    channels: list[_Channel]
-
-    def messages(self, keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        """Key, recorded time [ns] and bytes of each message of these channels."""
+# Gives the key, recorded time [ns] and bytes of each message of the channels with these keys.
+_Read = Callable[[Collection[int]], Iterator[tuple[int, int, bytes]]]
+_Storage = tuple[list[_Channel], _Read]
+"""Of one file of a bag."""
 
 
-class _Ros1Storage:
-    """A ``.bag``. Its clouds become CDR, which other messages are not."""
+def _open_ros1(path: Path, stack: ExitStack) -> _Storage:
+    """Open a ``.bag``. Its clouds become CDR, which other messages are not."""
+    from rosbags import rosbag1
 
-    def __init__(self, path: Path, stack: ExitStack) -> None:
-        require('rosbags.highlevel', 'rosbags')
-        from rosbags import rosbag1
+    bag = rosbag1.Reader(path)
+    bag.open()
+    stack.callback(bag.close)
 
-        self._reader = rosbag1.Reader(path)
-        self._reader.open()
-        stack.callback(self._reader.close)
-        self.channels = [
-            _Channel(c.id, c.topic, c.msgtype, self._encoding(c.msgtype), c.msgcount)
-            for c in self._reader.connections
-        ]
-
-    @staticmethod
-    def _encoding(msgtype: str) -> str:
-        return 'cdr' if msgtype == POINT_CLOUD2 else 'ros1'
-
-    def messages(self, keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        connections = [c for c in self._reader.connections if c.id in keys]
-        for connection, time, raw in self._reader.messages(connections):
+    def read(keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        for connection, time, raw in bag.messages([c for c in bag.connections if c.id in keys]):
             yield connection.id, time, jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2)
 
+    channels = []
+    for c in bag.connections:
+        encoding = 'cdr' if c.msgtype == POINT_CLOUD2 else 'ros1'
+        channels.append(_Channel(c.id, c.topic, c.msgtype, encoding, c.msgcount))
+    return channels, read
 
-class _SqliteStorage:
-    """A ``.db3`` of any version of rosbag2."""
 
-    def __init__(self, path: Path, stack: ExitStack) -> None:
-        check_sqlite_file(path)
-        address = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
-        database = sqlite3.connect(address, uri=True, check_same_thread=False)
-        self._database = stack.enter_context(closing(database))
-        counts = dict(database.execute('SELECT topic_id, count(*) FROM messages GROUP BY 1'))
-        topics = database.execute('SELECT id, name, type, serialization_format FROM topics')
-        self.channels = [
-            _Channel(key, name, msgtype, encoding, counts.get(key, 0))
-            for key, name, msgtype, encoding in topics
-        ]
+def _open_sqlite(path: Path, stack: ExitStack) -> _Storage:
+    """Open a ``.db3`` of any version of rosbag2."""
+    check_sqlite_file(path)
+    address = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
+    bag = stack.enter_context(closing(sqlite3.connect(address, uri=True, check_same_thread=False)))
+    counts = dict(bag.execute('SELECT topic_id, count(*) FROM messages GROUP BY topic_id'))
+    topics = bag.execute('SELECT id, name, type, serialization_format FROM topics')
+    channels = [
+        _Channel(n, topic, kind, form, counts.get(n, 0)) for n, topic, kind, form in topics
+    ]
 
-    def messages(self, keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        wanted = ', '.join(map(str, map(int, keys)))
-        yield from self._database.execute(
+    def read(keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        wanted = ', '.join(str(int(key)) for key in keys)
+        yield from bag.execute(
             'SELECT topic_id, timestamp, data FROM messages '
-            f'WHERE topic_id IN ({wanted}) ORDER BY timestamp, id'
+            f'WHERE topic_id IN ({wanted}) ORDER BY timestamp'
         )
 
+    return channels, read
 
-class _McapStorage:
-    """An ``.mcap``. Without an index of its chunks it is read in the order of the file."""
 
-    def __init__(self, path: Path, stack: ExitStack) -> None:
-        reader = require('mcap.reader', 'mcap')
-        check_mcap_file(path)
-        self._file = stack.enter_context(path.open('rb'))
-        self._reader = reader.SeekingReader(self._file, validate_crcs=True)
-        summary = self._reader.get_summary()
-        self._is_indexed = bool(summary and summary.chunk_indexes)
-        channels: dict[int, Any] = {}
-        schemas: dict[int, Any] = {}
-        counts: dict[int, int] = {}
-        indexed: set[int] = set()
-        if summary is not None:
-            channels, schemas = summary.channels, summary.schemas
-            counts = summary.statistics.channel_message_counts if summary.statistics else {}
-            indexed = {key for c in summary.chunk_indexes for key in c.message_index_offsets}
-        if not counts or not {*counts, *indexed} <= channels.keys():
-            counts = self._scan(channels, schemas)
-        self.channels = [
-            _Channel(
-                c.id,
-                c.topic,
-                schemas[c.schema_id].name if c.schema_id else '',
-                c.message_encoding,
-                counts.get(c.id, 0),
-            )
-            for c in channels.values()
-        ]
+def _open_mcap(path: Path, stack: ExitStack) -> _Storage:
+    """Open an ``.mcap``. Without an index of its chunks it is read in the order of the file."""
+    reader = require('mcap.reader', 'mcap')
+    check_mcap_file(path)
+    file = stack.enter_context(path.open('rb'))
+    bag = reader.SeekingReader(file, validate_crcs=True)
+    summary = bag.get_summary()
+    is_indexed = bool(summary and summary.chunk_indexes)
+    counts = summary.statistics.channel_message_counts if summary and summary.statistics else {}
+    channels, schemas = (summary.channels, summary.schemas) if summary else ({}, {})
+    if not counts or not counts.keys() <= channels.keys():
+        counts = _scan_mcap(file, channels, schemas)
 
-    def _scan(self, channels: dict[int, Any], schemas: dict[int, Any]) -> Counter[int]:
-        """Count the messages of a file whose summary does not; completes its channels."""
-        from mcap.records import Channel, Message, Schema
-        from mcap.stream_reader import StreamReader
-
-        counts: Counter[int] = Counter()
-        self._file.seek(0)
-        for record in StreamReader(self._file, validate_crcs=True).records:
-            if isinstance(record, Message):
-                counts[record.channel_id] += 1
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Schema):
-                schemas[record.id] = record
-        return counts
-
-    def messages(self, keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        topics = {c.topic for c in self.channels if c.key in keys}
-        found = self._reader.iter_messages(topics, log_time_order=self._is_indexed)
-        for _, channel, message in found:
+    def read(keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        topics = {channels[key].topic for key in keys}
+        for _, channel, message in bag.iter_messages(topics, log_time_order=is_indexed):
             if channel.id in keys:
                 yield channel.id, message.log_time, message.data
 
+    found = []
+    for c in channels.values():
+        msgtype = schemas[c.schema_id].name if c.schema_id else ''
+        found.append(_Channel(c.id, c.topic, msgtype, c.message_encoding, counts.get(c.id, 0)))
+    return found, read
 
-_STORAGES: dict[str, Callable[[Path, ExitStack], _Storage]] = {
-    '.bag': _Ros1Storage,
-    '.db3': _SqliteStorage,
-    '.mcap': _McapStorage,
-}
+
+def _scan_mcap(file: Any, channels: dict[int, Any], schemas: dict[int, Any]) -> Counter[int]:
+    """Count the messages of each channel, and complete those of the summary."""
+    from mcap.records import Channel, Message, Schema
+    from mcap.stream_reader import StreamReader
+
+    counts: Counter[int] = Counter()
+    file.seek(0)
+    for record in StreamReader(file, validate_crcs=True).records:
+        if isinstance(record, Message):
+            counts[record.channel_id] += 1
+        elif isinstance(record, Channel):
+            channels[record.id] = record
+        elif isinstance(record, Schema):
+            schemas[record.id] = record
+    return counts
+
+
+_OPENERS = {'.bag': _open_ros1, '.db3': _open_sqlite, '.mcap': _open_mcap}
 
 
 def _open_storage(file: Path, stack: ExitStack) -> _Storage:
     """Open one file of a bag; a packed one is unpacked first."""
-    if file.suffix not in PACKED_SUFFIXES:
-        return _STORAGES[file.suffix](file, stack)
-    plain = Path(stack.enter_context(tempfile.TemporaryDirectory()), file.stem)
-    with file.open('rb') as source, plain.open('wb') as target:
-        require('zstandard', 'zstandard').ZstdDecompressor().copy_stream(source, target)
-    return _STORAGES[plain.suffix](plain, stack)
+    if file.suffix in PACKED_SUFFIXES:
+        plain = Path(stack.enter_context(tempfile.TemporaryDirectory()), file.stem)
+        with file.open('rb') as source, plain.open('wb') as target:
+            require('zstandard', 'zstandard').ZstdDecompressor().copy_stream(source, target)
+        file = plain
+    return _OPENERS[file.suffix](file, stack)
 
 
 class BagReader(AbstractContextManager['BagReader']):
@@ -222,11 +176,11 @@ class BagReader(AbstractContextManager['BagReader']):
                 self._storages = [_open_storage(file, stack) for file in files]
             self._open = stack.pop_all()
         self._topics: dict[str, list[_Channel]] = {}
-        channels = [channel for storage in self._storages for channel in storage.channels]
+        found = [channel for channels, _ in self._storages for channel in channels]
         # What is recorded on a topic beside CDR is left.
-        for channel in sorted(channels, key=lambda c: c.encoding != 'cdr'):
+        for channel in sorted(found, key=_is_foreign):
             known = self._topics.setdefault(channel.topic, [])
-            if channel.encoding == (known or [channel])[0].encoding:
+            if not known or channel.encoding == known[0].encoding:
                 known.append(channel)
 
     def __exit__(self, *error: object) -> None:
@@ -287,10 +241,9 @@ class BagReader(AbstractContextManager['BagReader']):
         In order of their time; file after file in a split bag. Raises DataError if a topic is
         unknown, of several types or not in CDR, the bag damaged, or its list of messages wrong.
         """
-        expected = {name: self.n_messages(name) for name in topics or ()}
         if topics is None:
-            readable = [name for name, channels in self._topics.items() if _is_readable(channels)]
-            expected = {name: self.n_messages(name) for name in readable}
+            topics = [name for name in self._topics if _is_readable(self._topics[name])]
+        expected = {name: self.n_messages(name) for name in topics}
         for name in expected:
             if not _is_readable(self._topics[name]):
                 raise DataError(
@@ -298,13 +251,10 @@ class BagReader(AbstractContextManager['BagReader']):
                     'one topic must have one type, and be in CDR'
                 )
         found: Counter[str] = Counter()
-        for storage in self._storages:
-            names = {
-                c.key: c.topic
-                for c in storage.channels
-                if c.topic in expected and c.encoding == 'cdr'
-            }
-            for key, time, raw in self._read(storage, names):
+        for channels, read in self._storages:
+            wanted = [c for c in channels if c.topic in expected and not _is_foreign(c)]
+            names = {channel.key: channel.topic for channel in wanted}
+            for key, time, raw in self._read(read(names)) if names else ():
                 found[names[key]] += 1
                 yield names[key], time, raw
         for name, n_messages in expected.items():
@@ -315,9 +265,8 @@ class BagReader(AbstractContextManager['BagReader']):
                     f'or its {METADATA_FILE} belongs to another one'
                 )
 
-    def _read(self, storage: _Storage, keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        """Messages of one file, unpacked; errors of reading as DataError."""
-        source = storage.messages(keys) if keys else iter(())
+    def _read(self, source: Iterator[tuple[int, int, bytes]]) -> Iterator[tuple[int, int, bytes]]:
+        """Messages of one file, unpacked; what goes wrong is a DataError."""
         while True:
             # Errors of the caller, raised at the yield, must not pass through here.
             with reading(self.path):
@@ -330,9 +279,13 @@ class BagReader(AbstractContextManager['BagReader']):
             yield key, time, bytes(raw)
 
 
-def _is_readable(channels: Collection[_Channel]) -> bool:
+def _is_foreign(channel: _Channel) -> bool:
+    return channel.encoding != 'cdr'
+
+
+def _is_readable(channels: list[_Channel]) -> bool:
     """Whether the messages of a topic are of one type in CDR."""
-    return {c.encoding for c in channels} == {'cdr'} and len({c.msgtype for c in channels}) == 1
+    return len({c.msgtype for c in channels}) == 1 and not _is_foreign(channels[0])
 
 
 class BagWriter:
@@ -376,17 +329,22 @@ class BagWriter:
         """Give the bag its name, or remove it after an error."""
         self._open.__exit__(*error)
 
-    def add_topic(self, topic: BagTopic) -> None:
-        """Declare a topic, before its first message; raises `DataError` if it is there."""
-        if topic.name in self._connections:
-            raise DataError(f'{self.path}: topic {topic.name} twice')
+    def add_topic(self, name: str, msgtype: str = POINT_CLOUD2) -> None:
+        """Declare a topic of a type of ROS 2 Jazzy, before its first message; once.
+
+        It is offered reliably: with best effort, large clouds get lost when played.
+        """
+        from rosbags import interfaces as ros
+
+        if name in self._connections:
+            raise DataError(f'{self.path}: topic {name} twice')
+        forever = ros.QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
+        history, liveliness = ros.QosHistory.KEEP_LAST, ros.QosLiveliness.AUTOMATIC
+        kind = ros.QosReliability.RELIABLE, ros.QosDurability.VOLATILE
+        qos = ros.Qos(history, 10, *kind, forever, forever, liveliness, forever, False)
         with writing(self.path):
-            self._connections[topic.name] = self._writer.add_connection(
-                topic.name,
-                topic.msgtype,
-                msgdef=topic.definition,
-                rihs01=topic.type_hash,
-                offered_qos_profiles=topic.qos,
+            self._connections[name] = self._writer.add_connection(
+                name, msgtype, typestore=jazzy_types(), offered_qos_profiles=[qos]
             )
 
     def write(self, topic: str, time: int, raw: bytes | memoryview) -> None:
