@@ -89,6 +89,7 @@ CASES |= {
     ),
     'empty_line.pcd': (pcd(body=text_of(XYZ).replace(b'\n', b'\n\n')), 'x y z'),
     'blank_at_the_end.pcd': (pcd(body=text_of(XYZ) + b'\n  \n'), 'x y z'),
+    'byte_order_mark.pcd': (b'\xef\xbb\xbf' + pcd(), 'x y z'),
     'cr.pcd': (pcd().replace(b'\n', b'\r'), 'x y z'),
     'crlf.pcd': (pcd().replace(b'\n', b'\r\n'), 'x y z'),
     'tabs.pcd': (pcd().replace(b' ', b'\t'), 'x y z'),
@@ -182,6 +183,12 @@ CASES |= {
     'name_twice.ply': (
         ply('float x,float y,float z,ushort a,ushort a', rows(a=RING, b=RING), LE), 'x y z a a_2'
     ),
+    'byte_order_mark.ply': (b'\xef\xbb\xbf' + ply(), 'x y z'),
+    'nan_of_windows.ply': (
+        ply('float x,float y,float z,float i', with_ring('-nan(ind)', '1.#QNAN', '-1.#IND', 3)),
+        'x y z i',
+    ),
+    'word.ply': (ply('float x,float y,float z,float i', with_ring('a', 1, 2, 3)), 'x y z'),
     'cr.ply': (ply().replace(b'\n', b'\r'), 'x y z'),
     'cr_binary.ply': (ply(body=b'', form=LE).replace(b'\n', b'\r') + RAW, 'x y z'),
     'cr_before_a_line_feed.ply': (
@@ -460,6 +467,7 @@ CASES |= {
     'cut_in_a_word': (folder(lambda text: text[: text.index('relative') + 4]), NAMED),
     'no_yaml': (folder(lambda _: 'a: ['), NAMED),
     'no_text': (folder(lambda _: b'\xff\xfe\0'), NAMED),
+    'no_topics': (replaced('topics_with', 'x'), THREE),
     'null': (folder(lambda _: 'rosbag2_bagfile_information:\n'), NAMED),
     'null_topics': (replaced(CLOUDS, ''), THREE),
     'null_files': (replaced('    - drive.db3\n', ''), NAMED),

@@ -148,7 +148,8 @@ def test_bad_metadata(tmp_path):
     metadata = tmp_path / 'drive' / 'metadata.yaml'
     for text in ('', 'a: [', 'rosbag2_bagfile_information: {version: 9}', '- 1'):
         metadata.write_text(text)
-        assert 'cannot be read as a bag' in problem_of(tmp_path / 'drive')
+        said = problem_of(tmp_path / 'drive')
+        assert said.startswith(f'{metadata}: ') and 'ros2 bag reindex' in said
     metadata.unlink()
     missing = r'no metadata\.yaml in it\).*one by one: drive\.mcap'
     assert re.search(missing, problem_of(tmp_path / 'drive'))

@@ -79,16 +79,16 @@ def list_files(path: Path) -> tuple[list[Path], dict[str, int], bool]:
     if not path.is_dir():
         return [path], {}, False
     metadata = path / METADATA_FILE
-    again = f'`ros2 bag reindex {path}` writes it anew'
+    again = '`ros2 bag reindex` writes it anew'
     counts: Counter[str] = Counter()
     try:
         said = yaml.safe_load(metadata.read_bytes())['rosbag2_bagfile_information']
         files = [path / PurePath(name).name for name in said['relative_file_paths']]
-        for topic in said['topics_with_message_count'] or ():
+        for topic in said.get('topics_with_message_count') or ():
             counts[topic['topic_metadata']['name']] += int(topic['message_count'])
-    except (yaml.YAMLError, UnicodeError, LookupError, TypeError, ValueError) as error:
+    except (yaml.YAMLError, LookupError, TypeError, ValueError, AttributeError) as error:
         problem = 'cut off, or not as rosbag2 writes it' if metadata.stat().st_size else 'empty'
-        raise DataError(f'{metadata}: cannot be read as a bag: {problem}; {again}') from error
+        raise DataError(f'{metadata}: {problem}; {again}') from error
     if missing := [file.name for file in files if not file.is_file()]:
         raise DataError(f'{metadata}: {", ".join(missing)}: not there; {again}')
     if wrong := [file.name for file in files if not {*file.suffixes} & {*STORAGE_OF_SUFFIX}]:
@@ -114,8 +114,8 @@ def check_mcap_file(path: Path) -> None:
         raise ValueError(f'its first record is of kind {kind} and {n_bytes} bytes, of {size}')
     if profile == b'ros1':
         raise ValueError(
-            'its messages are of ROS 1; give the .bag that it was made from, or write a rosbag2 '
-            'from that: `rosbags-convert --src IN.bag --dst OUT`'
+            'its profile is ros1; give the .bag that it was made from, or convert that by '
+            '`rosbags-convert --src IN.bag --dst OUT`'
         )
 
 

@@ -152,7 +152,7 @@ def _open_storage(file: Path, stack: ExitStack) -> _Storage:
     if file.suffix in PACKED_SUFFIXES:
         plain = Path(stack.enter_context(tempfile.TemporaryDirectory()), file.stem)
         with file.open('rb') as source, plain.open('wb') as target:
-            require('zstandard', 'zstandard').ZstdDecompressor().copy_stream(source, target)
+            require('zstandard', 'mcap').ZstdDecompressor().copy_stream(source, target)
         file = plain
     return _OPENERS[file.suffix](file, stack)
 
@@ -274,7 +274,7 @@ class BagReader(AbstractContextManager['BagReader']):
                     return
                 key, time, raw = entry
                 if self._is_packed:
-                    unpacker = require('zstandard', 'zstandard').ZstdDecompressor()
+                    unpacker = require('zstandard', 'mcap').ZstdDecompressor()
                     raw = unpacker.decompressobj().decompress(raw)
             yield key, time, bytes(raw)
 

@@ -187,7 +187,7 @@ def split_header(data: bytes, last: str) -> tuple[list[str], bytes]:
     if found is None:
         raise PointCloudError(f'no {last} line of a header in it')
     try:
-        text = head[: found.end()].decode()
+        text = head[: found.end()].decode('utf-8-sig')
     except UnicodeDecodeError:
         text = head[: found.end()].decode('latin-1')
     return [line for line in re.split('[\r\n]+', text) if line.strip()], data[found.end() :]

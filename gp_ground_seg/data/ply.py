@@ -35,7 +35,7 @@ _CODES = {
 }  # fmt: skip
 _NAMES = {code: name for name, code in _CODES.items()}
 # int8, ..., of newer writers.
-_READABLE = {**_CODES, **{np.dtype(code).name: code for code in (*_NAMES, 'i8', 'u8')}}
+_READABLE = {**_CODES, **{np.dtype(code).name: code for code in (*_NAMES, 'i8', 'u8', 'f2')}}
 _ORDERS = {'ascii': '<', 'binary_little_endian': '<', 'binary_big_endian': '>'}
 
 
