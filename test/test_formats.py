@@ -142,8 +142,10 @@ def test_long_integers_in_a_ply_keep_their_value_or_are_refused(tmp_path):
     for kind in ('i8', 'u8'):
         found = reread(path, encode(path, gather({**xyz, 't': np.array([5, 2**53 - 1], kind)})))
         np.testing.assert_array_equal(found.fields['t'], [5, 2**53 - 1])
+        fields = gather({**xyz, 't': np.array([5, 2**53 + 1], kind)})
         with pytest.raises(DataError, match='field t: PLY has no type'):
-            encode(path, gather({**xyz, 't': np.array([5, 2**53 + 1], kind)}))
+            encode(path, fields)
+        assert_fields(reread(path, encode(path, fields, PlyHeader(has_long=True))).fields, fields)
 
 
 # Files of other writers.

@@ -34,15 +34,17 @@ _CODES = {
     'float': 'f4', 'double': 'f8',
 }  # fmt: skip
 _NAMES = {code: name for name, code in _CODES.items()}
+_LONG_NAMES = {'i8': 'int64', 'u8': 'uint64'}
 # int8, ..., of newer writers.
-_READABLE = {**_CODES, **{np.dtype(code).name: code for code in (*_NAMES, 'i8', 'u8', 'f2')}}
+_READABLE = {**_CODES, **{np.dtype(code).name: code for code in (*_NAMES, *_LONG_NAMES, 'f2')}}
 _ORDERS = {'ascii': '<', 'binary_little_endian': '<', 'binary_big_endian': '>'}
 
 
 class PlyHeader(NamedTuple):
-    """Comments of a header."""
+    """Comments of a header, and whether it has integers of 8 bytes, which few programs read."""
 
     remarks: tuple[str, ...] = ()
+    has_long: bool = False
 
 
 class _Element(NamedTuple):
@@ -99,7 +101,8 @@ def read_ply(data: bytes) -> tuple[Fields, PlyHeader]:
         note(f'PLY: lists of the vertices are left out: {", ".join(left_out)}')
     read = _read_text if form == 'ascii' else _read_binary
     fields = read(body, before, vertex, _ORDERS[form])
-    return fields.astype(fields.dtype.newbyteorder('=')), PlyHeader(tuple(remarks))
+    has_long = any(words[1] in _LONG_NAMES.values() for words in vertex.properties)
+    return fields.astype(fields.dtype.newbyteorder('=')), PlyHeader(tuple(remarks), has_long)
 
 
 def _read_text(data: bytes, before: list[_Element], vertex: _Element, order: str) -> Fields:
@@ -172,8 +175,9 @@ def _find_runs(
 
 def encode_ply(cloud: Cloud) -> bytes:
     """File of a cloud as vertices, binary, with the comments it was read with."""
-    fields = in_types(cloud.fields, _NAMES, 'PLY', flat=True)
     header = cloud.header if isinstance(cloud.header, PlyHeader) else PlyHeader()
+    names = {**_NAMES, **_LONG_NAMES} if header.has_long else _NAMES
+    fields = in_types(cloud.fields, names, 'PLY', flat=True)
     lines = [
         'ply',
         'format binary_little_endian 1.0',
@@ -181,5 +185,5 @@ def encode_ply(cloud: Cloud) -> bytes:
         f'element vertex {len(fields)}',
     ]
     for name in fields.dtype.names or ():
-        lines.append(f'property {_NAMES[fields.dtype[name].str[1:]]} {name}')
+        lines.append(f'property {names[fields.dtype[name].str[1:]]} {name}')
     return '\n'.join([*lines, 'end_header', '']).encode() + fields.tobytes()
