@@ -11,8 +11,10 @@ import bag_samples as samples
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rosbags import rosbag2
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosReliability
+from rosbags.typesys import Stores, get_typestore
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.atomic_output import leftovers, staged_files
@@ -81,6 +83,22 @@ def test_bags_without_definitions_are_read(tmp_path):
     samples.write_old_bag(tmp_path / 'old.db3', contents)
     expected = [('/points', 1000, raw), ('/secret', 1001, b'\0\1\0\0abc')]
     assert read_all(tmp_path / 'old.db3') == expected
+
+
+@pytest.mark.parametrize('storage', ['MCAP', 'SQLITE3'])
+@pytest.mark.parametrize('mode', ['FILE', 'MESSAGE'])
+def test_packed_bags_are_read(tmp_path, storage, mode):
+    raw = [encode_cloud(samples.cloud(k)) for k in range(2)]
+    plugin = rosbag2.StoragePlugin[storage]
+    writer = rosbag2.Writer(tmp_path / 'drive', version=9, storage_plugin=plugin)
+    writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        types = get_typestore(Stores.ROS2_JAZZY)
+        topic = writer.add_connection('/points', POINT_CLOUD2, typestore=types)
+        for k, data in enumerate(raw):
+            writer.write(topic, k, data)
+    assert is_bag_folder(tmp_path / 'drive')
+    assert read_all(tmp_path / 'drive') == [('/points', k, data) for k, data in enumerate(raw)]
 
 
 @pytest.fixture(scope='module')

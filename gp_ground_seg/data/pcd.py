@@ -1,8 +1,8 @@
 """PCD files of the Point Cloud Library: text, binary and compressed are read, binary written.
 
-Why not pypcd4 1.5: of 36 headers and texts of other programs it reads 12, those of the table in
-test/foreign_files.py; and it mixes up the numbers of a field of several in compressed files.
-Compressed files need the codec lzf.
+Why not pypcd4 1.5: it reads a third of what is read here of test/foreign_files.py, mixes up the
+numbers of a field of several in compressed files, and needs pydantic. Compressed files need the
+codec lzf.
 
 Source: https://pointclouds.org/documentation/tutorials/pcd_file_format.html, pcl/io/pcd_io.cpp.
 """

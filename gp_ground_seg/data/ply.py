@@ -8,11 +8,9 @@ Source: http://paulbourke.net/dataformats/ply/.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.data.clouds import (
@@ -134,43 +132,31 @@ def _without_lists(words: list[bytes], is_list: list[bool]) -> bytes:
 
 def _read_binary(data: bytes, before: list[_Element], vertex: _Element, order: str) -> Fields:
     place = 0
-    for element in before:
-        _, place = _find_runs(data, place, element.runs(order), element.n_rows, order)
-    runs = vertex.runs(order)
-    starts, _ = _find_runs(data, place, runs, vertex.n_rows, order)
-    if len(runs) == 1:
-        return np.frombuffer(data, runs[0][0], vertex.n_rows, place)
-    table = np.frombuffer(data, np.uint8)
-    columns = {}
-    for (run, *_), start in zip(runs, starts.T, strict=True):
-        if run.itemsize:
-            rows = table[start[:, None] + np.arange(run.itemsize)]
-            columns.update(scatter(rows.view(run).reshape(-1)))
-    return gather(columns)
+    parts: list[Fields] = []
+    for element in (*before, vertex):
+        parts, place = _read_rows(data, place, element, order)
+    columns = {name: values for part in parts for name, values in scatter(part).items()}
+    return parts[0] if len(parts) == 1 else gather(columns)
 
 
-def _find_runs(
-    data: bytes,
-    place: int,
-    runs: Sequence[tuple[np.dtype[Any], int, int]],
-    n_rows: int,
-    order: str,
-) -> tuple[npt.NDArray[np.int64], int]:
-    """Find where the runs of the rows from `place` on begin, (N, runs), and where the rows end."""
-    least = n_rows * sum(run.itemsize + count for run, count, _ in runs)
-    check_size(len(data) - place, n_rows, least)
+def _read_rows(data: bytes, place: int, element: _Element, order: str) -> tuple[list[Fields], int]:
+    """Read the runs of the rows that begin at `place`, and where they end."""
+    runs = element.runs(order)
+    least = element.n_rows * sum(run.itemsize + count for run, count, _ in runs)
+    check_size(len(data) - place, element.n_rows, least)
     if len(runs) == 1:
-        return np.empty((0, 1), np.int64), place + least
-    byte_order: Literal['little', 'big'] = 'little' if order == '<' else 'big'
-    starts = []
+        return [np.ndarray(element.n_rows, runs[0][0], data, place)], place + least
+    parts = [bytearray() for _ in runs]
     sizes = [(run.itemsize, count, item) for run, count, item in runs]
-    for _ in range(n_rows):
-        for size, count, item in sizes:
-            starts.append(place)
+    byte_order: Literal['little', 'big'] = 'little' if order == '<' else 'big'
+    for _ in range(element.n_rows):
+        for part, (size, count, item) in zip(parts, sizes, strict=True):
+            part += data[place : place + size]
             place += size + count
             place += item * int.from_bytes(data[place - count : place], byte_order)
-    check_size(len(data), n_rows, place)
-    return np.array(starts, np.int64).reshape(n_rows, len(runs)), place
+    check_size(len(data), element.n_rows, place)
+    rows = [np.ndarray(element.n_rows, runs[k][0], part) for k, part in enumerate(parts)]
+    return rows, place
 
 
 def encode_ply(cloud: Cloud) -> bytes:
