@@ -97,6 +97,7 @@ CASES |= {
     'umlaut.pcd': (pcd('x y z höhe', '4 4 4 2', 'F F F U', 'binary', rows(a=RING)), 'x y z höhe'),
     'cut.pcd': (pcd(data='binary', body=RAW[:-3]), 'truncated?'),
     'cut_text.pcd': (pcd(body=text_of(XYZ)[:-14]), 'truncated?'),
+    'space_in_a_name.pcd': (pcd('x y z my ring', '4 4 4 2', 'F F F U', COUNT=None), r'a name\?'),
     'no_fields.pcd': (pcd(FIELDS=None), 'no FIELDS line'),
 }  # fmt: skip
 
@@ -151,6 +152,11 @@ CASES |= {
     'list_between.ply': (ply(MIDDLE, middle_rows(), LE), 'x y z r'),
     'list_between_big.ply': (ply(MIDDLE, middle_rows('>'), BE), 'x y z r'),
     'list_between_text.ply': (ply(MIDDLE, MIDDLE_TEXT), 'x y z r'),
+    'lists_first.ply': (
+        ply('list uchar int v,list uchar int w,float x,float y,float z,list uchar int u',
+            b''.join(bytes(2) + row.tobytes() + bytes(1) for row in XYZ), LE),
+        'x y z',
+    ),
     'list_called_x.ply': (
         ply('list uchar int x,float y,float z', bytes(36), LE),
         'property x of the vertices: is a list',

@@ -2,14 +2,17 @@
 
 import re
 
+import bag_samples
 import numpy as np
 import pytest
 from foreign_files import CASES, XYZ
 
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.data.bags import BagReader
+from gp_ground_seg.data.bags import BagReader, BagWriter
 from gp_ground_seg.data.cloud_files import decode_file
+from gp_ground_seg.data.clouds import note
 from gp_ground_seg.data.inputs import list_inputs
+from gp_ground_seg.data.point_cloud2 import encode_cloud
 
 pytest.importorskip('lzf', reason='needs the extra formats')
 
@@ -43,3 +46,24 @@ def test_what_is_needed_is_read_of_every_file(tmp_path, name):
     if found != expected:
         assert str(path) in found and '\n' not in found
         assert re.search(expected, found)
+
+
+def test_a_field_twice_in_a_cloud_of_a_bag(tmp_path):
+    cloud = bag_samples.cloud()
+    cloud.fields[4].name = 'i'
+    with BagWriter(tmp_path / 'a.mcap') as bag:
+        bag.add_topic('/points')
+        bag.write('/points', 0, encode_cloud(cloud))
+    (one,) = list_inputs(tmp_path / 'a.mcap')
+    assert one.read().fields.dtype.names == ('x', 'y', 'z', 'i', 'i_2')
+
+
+def test_what_is_left_out_is_told_once(tmp_path, caplog):
+    caplog.set_level('INFO', 'gp_ground_seg')
+    note.cache_clear()
+    for name in ('list_last.ply', 'list_last_text.ply', 'list_last_big.ply', 'nan_as_integer.pcd'):
+        decode_file(tmp_path / name, CASES[name][0])
+    assert caplog.messages == [
+        'PLY: lists of the vertices are left out: views',
+        'field ring: has numbers that are no uint16; read as float64',
+    ]

@@ -19,7 +19,6 @@ METADATA_FILE = 'metadata.yaml'
 SUFFIX_OF_STORAGE = {'mcap': '.mcap', 'sqlite3': '.db3'}
 STORAGE_OF_SUFFIX = {suffix: storage for storage, suffix in SUFFIX_OF_STORAGE.items()}
 BAG_SUFFIXES = ('.bag', *STORAGE_OF_SUFFIX)
-
 PACKED_SUFFIXES = ('.zstd', '.zst')
 
 _FOLDER_SUFFIXES = ('.mcap', '.db3', '.db3-shm', '.db3-wal', *PACKED_SUFFIXES)
@@ -166,7 +165,7 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except (DataError, MissingDependencyError):
         raise
-    except Exception as error:  # Of many types: struct, apsw, lz4, asserts, ...
+    except Exception as error:  # Of many types: struct, sqlite3, lz4, asserts, ...
         said = in_one_line(error)
         step = next((f' ({hint})' for key, hint in _NEXT_STEP.items() if key in said), '')
         raise DataError(f'{path}: cannot be read as a bag: {said}{step}') from error

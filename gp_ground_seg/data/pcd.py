@@ -87,6 +87,10 @@ def _types_of(names: list[str], entries: dict[str, list[str]]) -> list[tuple[str
     types: list[tuple[str, str, Any]] = []
     defaults = {'TYPE': 'F', 'SIZE': '4', 'COUNT': '1'}
     columns = [entries.get(key, [word] * len(names)) for key, word in defaults.items()]
+    if {*map(len, columns)} != {len(names)}:
+        pairs = zip(defaults, columns, strict=True)
+        counts = ', '.join(f'{len(column)} {key}' for key, column in pairs)
+        raise PointCloudError(f'{len(names)} FIELDS, but {counts}; spaces in a name?')
     for name, kind, size, count in zip(distinct(names), *columns, strict=True):
         code, shape = f'{kind.lower()}{size}', () if count == '1' else (int(count),)
         if names[len(types)] == '_':
