@@ -7,7 +7,7 @@ from setuptools import find_packages, setup
 
 PACKAGE = 'gp_ground_seg'
 
-BAGS = ['rosbags>=0.11.9']
+BAGS = ['mcap>=1.5', 'rosbags>=0.11.9']
 EVALUATE = ['pandas>=2.1']
 FORMATS = ['python-neo-lzf>=0.3']
 PLOT = ['matplotlib>=3.6']

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds gp_ground_seg in a colcon workspace so that the node runs its compiled code: numba and rosbags
+# Builds gp_ground_seg in a colcon workspace so that the node runs its compiled code: numba, mcap and rosbags
 # go into a virtual environment of the workspace, whose interpreter becomes that of the executables.
 #   source /opt/ros/jazzy/setup.bash && src/gp_ground_seg/scripts/setup_workspace.sh [WORKSPACE]
 set -euo pipefail
@@ -26,7 +26,7 @@ touch "$venv/COLCON_IGNORE"
 # for coverage, and cannot be imported beside the one of Ubuntu 24.04 (7.4), which colcon's tests bring.
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
     --constraint <(/usr/bin/python3 -c 'import numpy, scipy; print(f"numpy=={numpy.__version__}\nscipy=={scipy.__version__}")') \
-    'numba>=0.60' 'coverage>=7.6' 'rosbags>=0.11.9' 'threadpoolctl>=3.1'
+    'numba>=0.60' 'coverage>=7.6' 'mcap>=1.5' 'rosbags>=0.11.9' 'threadpoolctl>=3.1'
 
 # colcon writes the interpreter that it runs in into the executables.
 cd "$workspace"

@@ -7,7 +7,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
-from gp_ground_seg.data.bags import BagWriter, cloud_topic, jazzy_topic
+from gp_ground_seg.data.bags import BagWriter
 from gp_ground_seg.data.point_cloud2 import encode_cloud
 
 START = 1_317_000_000_123_456_789
@@ -53,7 +53,7 @@ def string_message(text):
 
 def write_note(path, time, text, **options):
     with BagWriter(path, **options) as bag:
-        bag.add_topic(jazzy_topic('/note', 'std_msgs/msg/String'))
+        bag.add_topic('/note', 'std_msgs/msg/String')
         bag.write('/note', time, string_message(text))
 
 
@@ -62,8 +62,8 @@ def write_ros2_bag(path, n_clouds=3, topics=('/points',), storage=None, silent=(
     written = []
     with BagWriter(path, storage=storage) as bag:
         for topic in (*topics, *silent):
-            bag.add_topic(cloud_topic(topic))
-        bag.add_topic(jazzy_topic('/note', 'std_msgs/msg/String'))
+            bag.add_topic(topic)
+        bag.add_topic('/note', 'std_msgs/msg/String')
         for k in range(n_clouds):
             time = START + k * PERIOD
             entries = [('/note', time - 7, string_message(f'cloud {k}'))]

@@ -8,18 +8,18 @@ import sys
 from unittest.mock import Mock
 
 import bag_samples as samples
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rosbags import rosbag2
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosReliability
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_typestore
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.atomic_output import leftovers, staged_files
 from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag, is_bag_folder, resolve_storage
-from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic, jazzy_topic
+from gp_ground_seg.data.bags import BagReader, BagWriter
 from gp_ground_seg.data.point_cloud2 import encode_cloud
 
 SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive.db3', None)]
@@ -77,34 +77,28 @@ def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
         assert bag.deserialize(raw, POINT_CLOUD2).header.frame_id == 'velo_link'
 
 
-def copy_bag(source, target):
-    """Copy all messages; returns the topics of the source."""
-    with BagReader(source) as old, BagWriter(target) as new:
-        topics = [old.topic(name) for name in old.topics]
-        for topic in topics:
-            new.add_topic(topic)
-        for message in old.messages():
-            new.write(*message)
-    return topics
-
-
-def test_topics_copied_from_bag_to_bag_keep_definition_and_qos(tmp_path):
-    written = samples.write_ros2_bag(tmp_path / 'a.mcap')
-    originals = copy_bag(tmp_path / 'a.mcap', tmp_path / 'b.db3')
-    with BagReader(tmp_path / 'b.db3') as bag:
-        assert [bag.topic(name) for name in bag.topics] == originals
-        assert list(bag.messages()) == written
-
-
-def test_bags_without_definitions_are_read_and_copied(tmp_path):
+def test_bags_without_definitions_are_read(tmp_path):
     raw = encode_cloud(samples.cloud(0))
     contents = {'/points': (POINT_CLOUD2, raw), '/secret': ('my_msgs/msg/Unheard', b'\0\1\0\0abc')}
     samples.write_old_bag(tmp_path / 'old.db3', contents)
-    cloud, secret = copy_bag(tmp_path / 'old.db3', tmp_path / 'new')
-    assert 'MSG: sensor_msgs/PointField' in cloud.definition
-    assert secret.definition == ''
     expected = [('/points', 1000, raw), ('/secret', 1001, b'\0\1\0\0abc')]
-    assert read_all(tmp_path / 'new') == expected
+    assert read_all(tmp_path / 'old.db3') == expected
+
+
+@pytest.mark.parametrize('storage', ['MCAP', 'SQLITE3'])
+@pytest.mark.parametrize('mode', ['FILE', 'MESSAGE'])
+def test_packed_bags_are_read(tmp_path, storage, mode):
+    raw = [encode_cloud(samples.cloud(k)) for k in range(2)]
+    plugin = rosbag2.StoragePlugin[storage]
+    writer = rosbag2.Writer(tmp_path / 'drive', version=9, storage_plugin=plugin)
+    writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        types = get_typestore(Stores.ROS2_JAZZY)
+        topic = writer.add_connection('/points', POINT_CLOUD2, typestore=types)
+        for k, data in enumerate(raw):
+            writer.write(topic, k, data)
+    assert is_bag_folder(tmp_path / 'drive')
+    assert read_all(tmp_path / 'drive') == [('/points', k, data) for k, data in enumerate(raw)]
 
 
 @pytest.fixture(scope='module')
@@ -114,50 +108,27 @@ def ros1_bag(tmp_path_factory):
     return path
 
 
-def test_ros1_clouds_order_and_merged_publishers(ros1_bag):
+def test_clouds_of_ros1(ros1_bag):
     with BagReader(ros1_bag) as bag:
         assert bag.storage == 'ros1'
         topic = bag.pick_point_cloud_topic()
-        assert list(bag.messages([topic])) == [
+        expected = [
             (topic, samples.START + k * samples.PERIOD, encode_cloud(samples.cloud(k)))
             for k in range(3)
         ]
-        names, times, _ = zip(*bag.messages(), strict=True)
-        assert bag.n_messages('/text') == 6
-        # One of the two publishers latches.
-        assert [q.durability.name for q in bag.topic('/text').qos] == ['TRANSIENT_LOCAL']
-    assert list(names) == 3 * ['/kitti/velo/pointcloud', '/odd', '/text', '/text', '/range']
-    assert list(times) == sorted(times)
+        assert list(bag.messages([topic])) == list(bag.messages()) == expected
+        assert bag.topics['/odd'] == 'my_msgs/msg/Odd, ros1'
+        assert bag.n_messages('/text') == 6  # of two publishers
+        with pytest.raises(DataError, match=r'/range has messages of .*, ros1; one topic'):
+            next(bag.messages(['/range']))
 
 
-def test_ros1_types_unknown_to_ros2_are_carried_over_and_changed_ones_migrated(ros1_bag):
-    with BagReader(ros1_bag) as bag:
-        topic = bag.topic('/odd')
-        messages, ranges = ([raw for _, _, raw in bag.messages([t])] for t in ('/odd', '/range'))
-    types = get_typestore(Stores.EMPTY)
-    types.register(get_types_from_msg(topic.definition, topic.msgtype))
-    assert topic.type_hash == types.hash_rihs01(topic.msgtype)
-    for k, raw in enumerate(messages):
-        message = types.deserialize_cdr(raw, topic.msgtype)
-        assert message.header.frame_id == 'velo_link'
-        assert not hasattr(message.header, 'seq')
-        assert (message.when.sec, message.when.nanosec, message.value) == (k, 5, k / 3)
-        np.testing.assert_array_equal(message.bytes, np.arange(k))
-    # Range has more fields in ROS 2.
-    types = get_typestore(Stores.ROS2_JAZZY)
-    for k, raw in enumerate(ranges):
-        message = types.deserialize_cdr(raw, 'sensor_msgs/msg/Range')
-        assert (message.range, message.variance) == (1.0 + k, 0.0)
-
-
-def test_ros1_definition_that_cannot_be_parsed_concerns_its_topic_only(tmp_path, ros1_bag):
+def test_ros1_definition_that_cannot_be_parsed_does_not_concern_the_clouds(tmp_path, ros1_bag):
     text = ros1_bag.read_bytes()
     assert text.count(b'float64 value') >= 1
     broken = tmp_path / 'broken.bag'
     broken.write_bytes(text.replace(b'float64 value', b'float64 **** '))
-    with BagReader(broken) as bag:
-        assert len(list(bag.messages(['/kitti/velo/pointcloud', '/range']))) == 6
-    assert re.search('topic /odd .*cannot be converted from ROS 1', problem_of(broken))
+    assert read_all(broken) == read_all(ros1_bag)
 
 
 def test_several_cloud_topics_are_listed(tmp_path):
@@ -195,7 +166,8 @@ def test_bad_metadata(tmp_path):
     metadata = tmp_path / 'drive' / 'metadata.yaml'
     for text in ('', 'a: [', 'rosbag2_bagfile_information: {version: 9}', '- 1'):
         metadata.write_text(text)
-        assert 'cannot be read as a bag' in problem_of(tmp_path / 'drive')
+        said = problem_of(tmp_path / 'drive')
+        assert said.startswith(f'{metadata}: ') and 'ros2 bag reindex' in said
     metadata.unlink()
     missing = r'no metadata\.yaml in it\).*one by one: drive\.mcap'
     assert re.search(missing, problem_of(tmp_path / 'drive'))
@@ -260,7 +232,7 @@ def test_a_bag_is_replaced_with_force_only_and_by_a_whole_one_only(tmp_path, nam
 
     def fail_in_the_middle(force):
         with BagWriter(path, storage=storage, force=force) as bag:
-            bag.add_topic(cloud_topic('/points'))
+            bag.add_topic('/points')
             bag.write('/points', 5, encode_cloud(samples.cloud()))
             assert leftovers(path)
             raise ZeroDivisionError
@@ -277,7 +249,7 @@ def test_a_bag_is_replaced_with_force_only_and_by_a_whole_one_only(tmp_path, nam
     assert listing(tmp_path) == files
     assert not leftovers(path)
     with BagWriter(path, storage=storage, force=True) as bag:
-        bag.add_topic(jazzy_topic('/note', 'std_msgs/msg/String'))
+        bag.add_topic('/note', 'std_msgs/msg/String')
         bag.write('/note', 1, samples.string_message('new'))
         # Until the new one is complete, the old one is there.
         assert read_all(path) == before
@@ -345,29 +317,29 @@ def test_impossible_output_is_refused(tmp_path, name, storage, message):
 
 
 @pytest.mark.parametrize('name', ['a#1?.mcap', 'a [x]', 'ä ö'])
-def test_unusual_names_work_with_mcap(tmp_path, small_bags, name):
+def test_unusual_names_work(tmp_path, small_bags, name):
     written = samples.write_ros2_bag(tmp_path / name)
     assert read_all(tmp_path / name) == written
     assert [p.name for p in tmp_path.iterdir()] == [name]
-    shutil.copy(small_bags / 'drive.db3', tmp_path / 'a#2.db3')
-    with pytest.raises(DataError, match='cannot have # in its path'):
-        BagReader(tmp_path / 'a#2.db3')
+    shutil.copy(small_bags / 'drive.db3', tmp_path / 'a#2?.db3')
+    assert read_all(tmp_path / 'a#2?.db3') == read_all(small_bags / 'drive.db3')
     (tmp_path / f'.{name}.partial-1').mkdir()
     assert [p.name for p in leftovers(tmp_path / name)] == [f'.{name}.partial-1']
 
 
 def test_a_topic_is_declared_once_and_has_one_type(tmp_path):
     with BagWriter(tmp_path / 'x.mcap') as bag:
-        bag.add_topic(cloud_topic('/same'))
+        bag.add_topic('/same')
         with pytest.raises(DataError, match='topic /same twice'):
-            bag.add_topic(cloud_topic('/same'))
-        bag.add_topic(jazzy_topic('/diff', 'std_msgs/msg/String'))
+            bag.add_topic('/same')
+        bag.add_topic('/diff', 'std_msgs/msg/String')
         bag.write('/same', 1, encode_cloud(samples.cloud(n_ground=1, n_wall=1)))
         bag.write('/diff', 2, samples.string_message('x'))
     content = (tmp_path / 'x.mcap').read_bytes()
     (tmp_path / 'y.mcap').write_bytes(content.replace(b'/diff', b'/same'))
-    with pytest.raises(DataError, match='topic /same has messages of two types'):
-        BagReader(tmp_path / 'y.mcap')
+    found = 'topic /same has messages of sensor_msgs/msg/PointCloud2 and std_msgs/msg/String'
+    with BagReader(tmp_path / 'y.mcap') as bag, pytest.raises(DataError, match=found):
+        next(bag.messages(['/same']))
 
 
 def test_without_rosbags_the_error_says_what_to_install(tmp_path):

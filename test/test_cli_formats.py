@@ -182,7 +182,8 @@ def test_refused(tmp_path, monkeypatch, capsys, words, message):
     (tmp_path / 'taken.pcd').write_text('mine')
     fields = name_columns(POINTS)
     np.save(
-        'wide.npy', gather({**{n: fields[n] for n in 'xyz'}, 't': np.zeros(len(fields), 'u8')})
+        'wide.npy',
+        gather({**{n: fields[n] for n in 'xyz'}, 't': np.full(len(fields), 2**60, 'u8')}),
     )
     np.save('far.npy', 1000.0 * POINTS)
     np.save('none.npy', np.full((200, 3), np.nan))

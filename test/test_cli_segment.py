@@ -21,7 +21,7 @@ from evaluation_samples import label_files
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.core.pipeline.tilt import rotation
-from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
+from gp_ground_seg.data.bags import BagReader, BagWriter
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 
@@ -118,7 +118,7 @@ def test_empty_and_all_nan_clouds_give_empty_clouds(tmp_path):
     nothing = select_points(samples.cloud(0), np.zeros(1801, dtype=bool))
     nan = select_points(samples.cloud(0), np.arange(1801) == 1800)
     with BagWriter(tmp_path / 'in.mcap') as bag:
-        bag.add_topic(cloud_topic('/points'))
+        bag.add_topic('/points')
         for k, cloud in enumerate((nothing, nan)):
             bag.write('/points', k, encode_cloud(cloud))
     assert segment(tmp_path / 'in.mcap', '--format', 'npz', '-o', tmp_path / 'arrays') == 0
@@ -177,7 +177,7 @@ def test_bad_cloud_stops_the_run_and_is_named(tmp_path, capsys, damage, message)
     out = tmp_path / 'out'
     before = samples.write_ros2_bag(out)
     with BagWriter(tmp_path / 'in.mcap') as bag:
-        bag.add_topic(cloud_topic('/points'))
+        bag.add_topic('/points')
         for k in range(4):
             raw = encode_cloud(samples.cloud(k))
             bag.write('/points', 1000 + k, damage(raw) if k == 2 else raw)

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.data.bags import BagWriter, cloud_topic
+from gp_ground_seg.data.bags import BagWriter
 from gp_ground_seg.data.cloud_files import WRITABLE, decode_file, encode_file, read_file
 from gp_ground_seg.data.clouds import cloud_of, gather, name_columns
 from gp_ground_seg.data.pcd import PcdHeader
@@ -112,6 +112,40 @@ def test_what_a_format_beside_its_points_says_is_kept(tmp_path):
     path.write_bytes(encode_file(path, read_file(path), {'label': np.zeros(60, np.uint8)}))
     with np.load(path) as found:
         np.testing.assert_array_equal(found['pose'], np.eye(4))
+
+
+NAMES = (
+    'a b', 'a_b', 'a  b', 'a_b_2', 'a', 'a_0', 'a 1', 'label', 'gp_label', '_', ' ', 'field', 'X',
+    'höhe', '高さ', 'points', 'file', 'allow_pickle', 'self',
+)  # fmt: skip
+
+
+@pytest.mark.parametrize('suffix', WRITABLE)
+def test_no_column_is_lost_when_written(tmp_path, suffix):
+    columns = {name: np.full(3, k, 'u2') for k, name in enumerate(NAMES)}
+    columns['a'] = np.arange(100, 106, dtype='u2').reshape(3, 2)
+    fields = gather({**{name: np.arange(3, dtype='f4') for name in 'xyz'}, **columns})
+    path = tmp_path / f'a{suffix}'
+    found = reread(path, encode(path, fields, label=np.full(3, 77, 'u1'))).fields
+    values = [v for name in found.dtype.names[3:] for v in np.ravel(found[name])]
+    expected = [77] * 3 + [v for column in columns.values() for v in column.ravel()]
+    assert sorted(values) == sorted(expected)
+    # A name that can be kept is; nothing else takes it.
+    for name in ('a_b', 'a_b_2', 'a_0', 'label', 'gp_label', 'field', 'X', 'höhe', '高さ'):
+        np.testing.assert_array_equal(found[name], columns[name])
+    np.testing.assert_array_equal(found['gp_gp_label'], 77)
+
+
+def test_long_integers_in_a_ply_keep_their_value_or_are_refused(tmp_path):
+    path = tmp_path / 'a.ply'
+    xyz = {name: np.zeros(2, 'f4') for name in 'xyz'}
+    for kind in ('i8', 'u8'):
+        found = reread(path, encode(path, gather({**xyz, 't': np.array([5, 2**53 - 1], kind)})))
+        np.testing.assert_array_equal(found.fields['t'], [5, 2**53 - 1])
+        fields = gather({**xyz, 't': np.array([5, 2**53 + 1], kind)})
+        with pytest.raises(DataError, match='field t: PLY has no type'):
+            encode(path, fields)
+        assert_fields(reread(path, encode(path, fields, PlyHeader(has_long=True))).fields, fields)
 
 
 # Files of other writers.
@@ -235,6 +269,11 @@ def test_what_other_programs_write_is_read(tmp_path, name):
 
 
 def test_arrays_of_every_kind(tmp_path):
+    xyz = dict(zip('XYZ', np.arange(9.0).reshape(3, 3), strict=True))
+    np.savez(tmp_path / 'fields.npz', **xyz, points=np.arange(3), pose=np.eye(4))
+    np.save(tmp_path / 'fields.npy', gather(xyz))
+    for name in ('fields.npy', 'fields.npz'):
+        np.testing.assert_array_equal(read_file(tmp_path / name).xyz.T, list(xyz.values()))
     table = np.random.default_rng(1).normal(size=(9, 5))
     np.save(tmp_path / 'table.npy', np.asfortranarray(table))
     np.savez_compressed(tmp_path / 'table.npz', points=table, ring=np.arange(9))
@@ -355,7 +394,7 @@ LIES = {
         'property x of the vertices: is a list',
     ),
     'many.ply': (FOREIGN['pcl.ply'][0].replace(b'vertex 4', b'vertex 4000000'), '4000000 points'),
-    'faces.ply': (ply(['format ascii 1.0', 'element face 0'], b''), 'must begin with the vert'),
+    'faces.ply': (ply(['format ascii 1.0', 'element face 0'], b''), 'no vertices of a PLY in it'),
 }  # fmt: skip
 
 
@@ -367,7 +406,7 @@ def bag_of(suffix, **changes):
         for name, value in changes.items():
             setattr(points, name, value)
         with BagWriter(path) as bag:
-            bag.add_topic(cloud_topic('/points'))
+            bag.add_topic('/points')
             bag.write('/points', 0, encode_cloud(points))
         return path.read_bytes()
 

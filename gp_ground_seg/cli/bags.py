@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
-from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
+from gp_ground_seg.data.bags import BagReader, BagWriter
 from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns, encode_cloud
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
 from gp_ground_seg.ros.start_stop import large_cloud_transport, needing_ros, ros_session
@@ -114,7 +114,7 @@ def run_convert(arguments: argparse.Namespace) -> int:
         BagWriter(target, force=arguments.force) as bag,
         options.progress('kitti-to-bag', quiet=arguments.quiet)(total=len(frames)) as bar,
     ):
-        bag.add_topic(cloud_topic(TOPIC))
+        bag.add_topic(TOPIC)
         for frame, stamp in zip(frames, stamps, strict=True):
             points = read_points(frame.points_path, frame.columns)
             labels = {}

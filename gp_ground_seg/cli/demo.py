@@ -17,7 +17,7 @@ from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.data.atomic_output import staged_files
-from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
+from gp_ground_seg.data.bags import BagReader, BagWriter
 from gp_ground_seg.data.point_cloud2 import (
     CloudMessage,
     decode_cloud,
@@ -158,7 +158,7 @@ def _write(n_frames: int, path: Path, session: Session) -> None:
         flush=True,
     )
     with options.progress('scans')(total=n_frames) as bar, BagWriter(path) as bag:
-        bag.add_topic(cloud_topic(TOPIC))
+        bag.add_topic(TOPIC)
         for points, semantic, seconds in simulated_drive(n_frames):
             stamp = EPOCH * 10**9 + round(seconds * 1e9)
             label = semantic.astype(np.uint32)

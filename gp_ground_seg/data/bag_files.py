@@ -2,45 +2,34 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import struct
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePath
+
+import yaml
 
 from gp_ground_seg.core.errors import DataError, MissingDependencyError, in_one_line
 
 POINT_CLOUD2 = 'sensor_msgs/msg/PointCloud2'
-UNKNOWN_TYPE_HASH = 'RIHS01_' + 64 * '0'  # what rosbag2 itself stores is no valid hash
 METADATA_FILE = 'metadata.yaml'
 SUFFIX_OF_STORAGE = {'mcap': '.mcap', 'sqlite3': '.db3'}
 STORAGE_OF_SUFFIX = {suffix: storage for storage, suffix in SUFFIX_OF_STORAGE.items()}
 BAG_SUFFIXES = ('.bag', *STORAGE_OF_SUFFIX)
+PACKED_SUFFIXES = ('.zstd', '.zst')
 
-_FOLDER_SUFFIXES = ('.mcap', '.db3', '.db3-shm', '.db3-wal', '.zstd', '.zst')
-# Part of an error of rosbags -> a hint at what to do.
+_FOLDER_SUFFIXES = ('.mcap', '.db3', '.db3-shm', '.db3-wal', *PACKED_SUFFIXES)
+_MCAP_MAGIC = b'\x89MCAP0\r\n'
+# Part of an error of reading -> a hint at what to do.
 _NEXT_STEP = {
-    'end magic': 'truncated, or still being recorded; `mcap recover` saves the readable part',
+    'EndOfFile': 'damaged; `mcap recover` saves the readable part',
     'not indexed': 'truncated, or still being recorded; `rosbag reindex` saves the readable part',
     'index looks damaged': 'truncated? `rosbag reindex` saves the readable part',
     'malformed': 'truncated or overwritten? `sqlite3 .recover` saves the readable part',
 }
-
-
-@dataclass(frozen=True)
-class BagTopic:
-    """A topic in ROS 2 terms."""
-
-    name: str
-    msgtype: str  # as in ``sensor_msgs/msg/PointCloud2``
-    definition: str  # text of the message definition, empty if unknown
-    type_hash: str  # RIHS01
-    encoding: str = 'cdr'  # of the messages; ``cdr`` for all that ROS 2 writes itself
-    qos: tuple[Any, ...] = ()  # offered by the publishers (``rosbags.interfaces.Qos``)
-    n_messages: int = 0
-    problem: str = ''  # why messages of ROS 1 cannot be converted, empty if they can
 
 
 def is_bag(path: str | Path) -> bool:
@@ -71,9 +60,6 @@ def check_is_bag(path: Path) -> None:
     """Raise `DataError` with the next step if `path` cannot be a bag."""
     if not path.exists():
         raise DataError(f'{path}: no such file or folder')
-    for file in path.glob('*.db3') if path.is_dir() else [path]:
-        if file.suffix == '.db3':
-            _check_sqlite_file(file)
     if path.is_dir() and not is_bag(path):
         files = sorted(child.name for child in path.iterdir() if child.suffix in BAG_SUFFIXES)
         hint = f'; bag files in it, to be given one by one: {", ".join(files)}' if files else ''
@@ -84,6 +70,54 @@ def check_is_bag(path: Path) -> None:
         )
 
 
+def list_files(path: Path) -> tuple[list[Path], dict[str, int], bool]:
+    """Files of a bag, messages of each topic, and whether each is packed, by metadata.yaml.
+
+    Of the rest nothing is needed to read a bag. A bag of one file has no such counts.
+    """
+    if not path.is_dir():
+        return [path], {}, False
+    metadata = path / METADATA_FILE
+    again = '`ros2 bag reindex` writes it anew'
+    counts: Counter[str] = Counter()
+    try:
+        said = yaml.safe_load(metadata.read_bytes())['rosbag2_bagfile_information']
+        files = [path / PurePath(name).name for name in said['relative_file_paths']]
+        for topic in said.get('topics_with_message_count') or ():
+            counts[topic['topic_metadata']['name']] += int(topic['message_count'])
+    except (yaml.YAMLError, LookupError, TypeError, ValueError, AttributeError) as error:
+        problem = 'cut off, or not as rosbag2 writes it' if metadata.stat().st_size else 'empty'
+        raise DataError(f'{metadata}: {problem}; {again}') from error
+    if missing := [file.name for file in files if not file.is_file()]:
+        raise DataError(f'{metadata}: {", ".join(missing)}: not there; {again}')
+    if wrong := [file.name for file in files if not {*file.suffixes} & {*STORAGE_OF_SUFFIX}]:
+        raise DataError(f'{metadata}: {", ".join(wrong)}: accepted are .mcap and .db3')
+    return files, counts, str(said.get('compression_mode')).lower() == 'message'
+
+
+def check_mcap_file(path: Path) -> None:
+    """Raise ValueError where an MCAP file has no end, or is of ROS 1."""
+    with path.open('rb') as file:
+        start = file.read(25)
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - len(_MCAP_MAGIC), 0))
+        end = file.read()
+    if not start.startswith(_MCAP_MAGIC):
+        raise ValueError('no MCAP' if start else 'empty')
+    if end != _MCAP_MAGIC or len(start) < 25:
+        raise ValueError(
+            'truncated, or still being recorded; `mcap recover` saves the readable part'
+        )
+    kind, n_bytes, _, profile = struct.unpack_from('<BQI4s', start, len(_MCAP_MAGIC))
+    if kind != 1 or n_bytes > size:
+        raise ValueError(f'its first record is of kind {kind} and {n_bytes} bytes, of {size}')
+    if profile == b'ros1':
+        raise ValueError(
+            'its profile is ros1; give the .bag that it was made from, or convert that by '
+            '`rosbags-convert --src IN.bag --dst OUT`'
+        )
+
+
 def check_sqlite_path(path: Path) -> None:
     """Raise `DataError` for a path that rosbags, which gives it to sqlite as a URI, misreads."""
     awkward = sorted(set('?#%') & set(str(path.absolute())))
@@ -91,9 +125,8 @@ def check_sqlite_path(path: Path) -> None:
         raise DataError(f'{path}: a sqlite3 bag cannot have {" ".join(awkward)} in its path')
 
 
-def _check_sqlite_file(path: Path) -> None:
+def check_sqlite_file(path: Path) -> None:
     """Raise `DataError` where part of a sqlite file is cut off, or still in a journal."""
-    check_sqlite_path(path)
     with path.open('rb') as file:
         header = file.read(100)
     # The format is that of https://www.sqlite.org/fileformat.html.
@@ -132,7 +165,7 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except (DataError, MissingDependencyError):
         raise
-    except Exception as error:  # Of many types: struct, apsw, lz4, asserts, ...
+    except Exception as error:  # Of many types: struct, sqlite3, lz4, asserts, ...
         said = in_one_line(error)
         step = next((f' ({hint})' for key, hint in _NEXT_STEP.items() if key in said), '')
         raise DataError(f'{path}: cannot be read as a bag: {said}{step}') from error

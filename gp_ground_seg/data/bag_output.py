@@ -10,7 +10,7 @@ from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES
-from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
+from gp_ground_seg.data.bags import BagReader, BagWriter
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 
 TOPICS = {'/ground': Label.GROUND, '/obstacles': Label.OBSTACLE}
@@ -46,7 +46,7 @@ def write_bag(
             storage = bag.storage
         with BagWriter(target, storage=storage, force=force) as output:
             for part in TOPICS:
-                output.add_topic(cloud_topic(part))
+                output.add_topic(part)
             for k, (_, time, raw) in enumerate(bag.messages([topic])):
                 try:
                     cloud = decode_cloud(raw)

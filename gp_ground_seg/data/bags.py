@@ -1,37 +1,39 @@
 """Bags: ROS 1, rosbag2 folders, MCAP and sqlite3 files read; rosbag2 written whole or not at all.
 
-The one module that imports rosbags, an optional package; only where a bag is used.
+The one module that imports rosbags, mcap and zstandard, optional packages; only where a bag is
+used. Why not rosbags for MCAP and rosbag2 folders: a channel of protobuf or JSON, no profile, or
+one line of metadata.yaml that is not needed stop it (test/foreign_files.py).
 """
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import os
+import sqlite3
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from contextlib import AbstractContextManager, ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack, closing
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from gp_ground_seg.core.errors import DataError, in_one_line, require
+from gp_ground_seg.core.errors import DataError, require
 from gp_ground_seg.data.atomic_output import staged_bag_folder, staged_file
 from gp_ground_seg.data.bag_files import (
     METADATA_FILE,
+    PACKED_SUFFIXES,
     POINT_CLOUD2,
     STORAGE_OF_SUFFIX,
     SUFFIX_OF_STORAGE,
-    UNKNOWN_TYPE_HASH,
-    BagTopic,
     check_is_bag,
+    check_mcap_file,
+    check_sqlite_file,
+    list_files,
     reading,
     resolve_storage,
     storage_of,
     writing,
 )
-
-_HEADER = 'std_msgs/msg/Header'
-_RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
 
 
 @functools.cache
@@ -43,109 +45,143 @@ def jazzy_types() -> Any:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-def jazzy_topic(name: str, msgtype: str) -> BagTopic:
-    """Topic of a type that is part of ROS 2 Jazzy."""
-    return _topic_of(jazzy_types(), name, msgtype, ())
+class _Channel(NamedTuple):
+    """Messages of one topic, type and encoding in one file; `key` is its number there."""
+
+    key: int
+    topic: str
+    msgtype: str
+    encoding: str
+    n_messages: int
 
 
-def cloud_topic(name: str) -> BagTopic:
-    """PointCloud2 topic offered reliably; with best effort, large clouds get lost when played."""
-    return _topic_of(jazzy_types(), name, POINT_CLOUD2, (_reliable_qos('VOLATILE'),))
+# Gives the key, recorded time [ns] and bytes of each message of the channels with these keys.
+_Read = Callable[[Collection[int]], Iterator[tuple[int, int, bytes]]]
+_Storage = tuple[list[_Channel], _Read]
+"""Of one file of a bag."""
 
 
-def _topic_of(types: Any, name: str, msgtype: str, qos: tuple[Any, ...]) -> BagTopic:
-    definition, _ = types.generate_msgdef(msgtype, ros_version=2)
-    return BagTopic(name, msgtype, definition, types.hash_rihs01(msgtype), qos=qos)
+def _open_ros1(path: Path, stack: ExitStack) -> _Storage:
+    """Open a ``.bag``. Its clouds become CDR, which other messages are not."""
+    from rosbags import rosbag1
+
+    bag = rosbag1.Reader(path)
+    bag.open()
+    stack.callback(bag.close)
+
+    def read(keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        for connection, time, raw in bag.messages([c for c in bag.connections if c.id in keys]):
+            yield connection.id, time, jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2)
+
+    channels = []
+    for c in bag.connections:
+        encoding = 'cdr' if c.msgtype == POINT_CLOUD2 else 'ros1'
+        channels.append(_Channel(c.id, c.topic, c.msgtype, encoding, c.msgcount))
+    return channels, read
 
 
-def _reliable_qos(durability: str) -> Any:
-    from rosbags import interfaces as ros
+def _open_sqlite(path: Path, stack: ExitStack) -> _Storage:
+    """Open a ``.db3`` of any version of rosbag2."""
+    check_sqlite_file(path)
+    address = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
+    bag = stack.enter_context(closing(sqlite3.connect(address, uri=True, check_same_thread=False)))
+    counts = dict(bag.execute('SELECT topic_id, count(*) FROM messages GROUP BY topic_id'))
+    topics = bag.execute('SELECT id, name, type, serialization_format FROM topics')
+    channels = [
+        _Channel(n, topic, kind, form, counts.get(n, 0)) for n, topic, kind, form in topics
+    ]
 
-    forever = ros.QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
-    history, liveliness = ros.QosHistory.KEEP_LAST, ros.QosLiveliness.AUTOMATIC
-    kind = ros.QosReliability.RELIABLE, ros.QosDurability[durability]
-    return ros.Qos(history, 10, *kind, forever, forever, liveliness, forever, False)
-
-
-@functools.cache
-def _parse_definition(text: str, msgtype: str) -> Any:
-    """Types of one definition (.msg or .idl text) in a separate store, only to be read."""
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.EMPTY)
-    separator = 80 * '=' + '\n'
-    if text.startswith(f'{separator}IDL: '):
-        parts = (part.partition('\n')[2] for part in text.split(separator)[1:])
-        types = {name: kind for part in parts for name, kind in get_types_from_idl(part).items()}
-    else:
-        types = get_types_from_msg(text, msgtype)
-    store.register(types)
-    return store
-
-
-def _ros2_topic(connection: Any) -> BagTopic:
-    """Topic of a rosbag2 connection; older bags have neither definition nor hash."""
-    msgtype, text = connection.msgtype, connection.msgdef.data
-    type_hash = connection.digest if text else ''
-    if not text and msgtype in jazzy_types().fielddefs:
-        known = jazzy_topic(connection.topic, msgtype)
-        text, type_hash = known.definition, known.type_hash
-    elif text and not type_hash:
-        with suppress(Exception):  # A definition rosbags cannot parse is copied all the same.
-            type_hash = _parse_definition(text, msgtype).hash_rihs01(msgtype)
-    encoding, qos = connection.ext
-    known_hash = type_hash or UNKNOWN_TYPE_HASH
-    return BagTopic(connection.topic, msgtype, text, known_hash, encoding, tuple(qos))
-
-
-def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
-    """Topic of a ROS 1 connection, and a function that converts its messages to CDR."""
-    from rosbags.convert.converter import is_same_wireformat, migrate_bytes
-    from rosbags.typesys import Stores, get_typestore
-
-    old = connection.msgtype
-    new = _RENAMED.get(old, old)
-    source, target = _parse_definition(connection.msgdef.data, old), jazzy_types()
-    if new not in target.fielddefs:
-        header = target.fielddefs[_HEADER]
-        target = get_typestore(Stores.EMPTY)
-        target.register({**source.fielddefs, _HEADER: header})
-    convert: Callable[[bytes], Any] = functools.partial(target.ros1_to_cdr, typename=new)
-    # In the same layout only a header's ``seq`` goes; else fields of one name keep their value.
-    if not is_same_wireformat(source, target, old, new):
-        convert = functools.partial(
-            migrate_bytes, source, target, old, new, {}, src_is2=False, dst_is2=True
+    def read(keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        wanted = ', '.join(str(int(key)) for key in keys)
+        yield from bag.execute(
+            'SELECT topic_id, timestamp, data FROM messages '
+            f'WHERE topic_id IN ({wanted}) ORDER BY timestamp'
         )
-    qos = (_reliable_qos('TRANSIENT_LOCAL'),) if connection.ext.latching else ()
-    return _topic_of(target, connection.topic, new, qos), convert
+
+    return channels, read
+
+
+def _open_mcap(path: Path, stack: ExitStack) -> _Storage:
+    """Open an ``.mcap``. Without an index of its chunks it is read in the order of the file."""
+    reader = require('mcap.reader', 'mcap')
+    check_mcap_file(path)
+    file = stack.enter_context(path.open('rb'))
+    bag = reader.SeekingReader(file, validate_crcs=True)
+    summary = bag.get_summary()
+    is_indexed = bool(summary and summary.chunk_indexes)
+    counts = summary.statistics.channel_message_counts if summary and summary.statistics else {}
+    channels, schemas = (summary.channels, summary.schemas) if summary else ({}, {})
+    if not counts or not counts.keys() <= channels.keys():
+        counts = _scan_mcap(file, channels, schemas)
+
+    def read(keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        topics = {channels[key].topic for key in keys}
+        for _, channel, message in bag.iter_messages(topics, log_time_order=is_indexed):
+            if channel.id in keys:
+                yield channel.id, message.log_time, message.data
+
+    found = []
+    for c in channels.values():
+        msgtype = schemas[c.schema_id].name if c.schema_id else ''
+        found.append(_Channel(c.id, c.topic, msgtype, c.message_encoding, counts.get(c.id, 0)))
+    return found, read
+
+
+def _scan_mcap(file: Any, channels: dict[int, Any], schemas: dict[int, Any]) -> Counter[int]:
+    """Count the messages of each channel, and complete those of the summary."""
+    from mcap.records import Channel, Message, Schema
+    from mcap.stream_reader import StreamReader
+
+    counts: Counter[int] = Counter()
+    file.seek(0)
+    for record in StreamReader(file, validate_crcs=True).records:
+        if isinstance(record, Message):
+            counts[record.channel_id] += 1
+        elif isinstance(record, Channel):
+            channels[record.id] = record
+        elif isinstance(record, Schema):
+            schemas[record.id] = record
+    return counts
+
+
+_OPENERS = {'.bag': _open_ros1, '.db3': _open_sqlite, '.mcap': _open_mcap}
+
+
+def _open_storage(file: Path, stack: ExitStack) -> _Storage:
+    """Open one file of a bag; a packed one is unpacked first."""
+    if file.suffix in PACKED_SUFFIXES:
+        plain = Path(stack.enter_context(tempfile.TemporaryDirectory()), file.stem)
+        with file.open('rb') as source, plain.open('wb') as target:
+            require('zstandard', 'mcap').ZstdDecompressor().copy_stream(source, target)
+        file = plain
+    return _OPENERS[file.suffix](file, stack)
 
 
 class BagReader(AbstractContextManager['BagReader']):
     """A bag as ROS 2 topics with CDR messages, to be used in a ``with`` statement.
 
-    `path` is a ROS 1 ``.bag``, whose messages are converted, a rosbag2 folder, ``.mcap`` or
-    ``.db3``. Raises DataError if it cannot be read, MissingDependencyError without rosbags.
+    `path` is a ROS 1 ``.bag``, whose clouds are converted, a rosbag2 folder, ``.mcap`` or
+    ``.db3``. Topics of other encodings are listed, and not read. Raises DataError if it cannot be
+    read, MissingDependencyError without rosbags and mcap.
     """
 
     def __init__(self, path: str | Path) -> None:
-        require('rosbags.highlevel', 'rosbags')
-        from rosbags import rosbag1, rosbag2
-
+        require('rosbags.highlevel', 'rosbags mcap')
         self.path = Path(path)
         self.storage = storage_of(self.path)  # ``ros1``, ``mcap`` or ``sqlite3``
-        self._converters: dict[int, Callable[[bytes], Any]] = {}
         with ExitStack() as stack:
             with reading(self.path):
                 check_is_bag(self.path)
-                rosbag: Any = rosbag1 if self.storage == 'ros1' else rosbag2
-                reader = rosbag.Reader(self.path)
-                reader.open()
-                stack.callback(reader.close)
-            self._reader = reader
-            self._topics: dict[str, BagTopic] = {}
-            for connection in reader.connections:
-                self._add(self._describe(connection), connection.msgcount)
+                files, self._counts, self._is_packed = list_files(self.path)
+                self._storages = [_open_storage(file, stack) for file in files]
             self._open = stack.pop_all()
+        self._topics: dict[str, list[_Channel]] = {}
+        found = [channel for channels, _ in self._storages for channel in channels]
+        # What is recorded on a topic beside CDR is left.
+        for channel in sorted(found, key=_is_foreign):
+            known = self._topics.setdefault(channel.topic, [])
+            if not known or channel.encoding == known[0].encoding:
+                known.append(channel)
 
     def __exit__(self, *error: object) -> None:
         """Close the files; nothing can be read afterwards."""
@@ -153,36 +189,38 @@ class BagReader(AbstractContextManager['BagReader']):
 
     @property
     def topics(self) -> dict[str, str]:
-        """Message type of each topic, as in ``sensor_msgs/msg/PointCloud2``."""
-        return {name: topic.msgtype for name, topic in self._topics.items()}
+        """Type of the messages of each topic; those not in CDR with their encoding."""
+        return {name: self._kind(name) for name in self._topics}
+
+    def _kind(self, topic: str) -> str:
+        channels = self._topics[topic]
+        types = ' and '.join(sorted({channel.msgtype for channel in channels}))
+        encoding = channels[0].encoding
+        return types if encoding == 'cdr' else ', '.join(filter(None, (types, encoding)))
 
     @property
     def point_cloud_topics(self) -> list[str]:
         """Names of the PointCloud2 topics."""
-        kind = POINT_CLOUD2, 'cdr'
-        return [name for name, t in self._topics.items() if (t.msgtype, t.encoding) == kind]
-
-    def topic(self, name: str) -> BagTopic:
-        """Return the description of a topic; raises DataError if there is none of that name."""
-        if name not in self._topics:
-            raise DataError(f'{self.path}: no topic {name}; topics here: {self._list_topics()}')
-        return self._topics[name]
+        return [name for name, kind in self.topics.items() if kind == POINT_CLOUD2]
 
     def _list_topics(self) -> str:
         return ', '.join(f'{name} ({kind})' for name, kind in self.topics.items()) or 'none'
 
     def n_messages(self, topic: str) -> int:
-        """Messages of one topic; raises as `topic` does."""
-        return self.topic(topic).n_messages
+        """Messages of one topic; raises DataError if there is none of that name."""
+        if topic not in self._topics:
+            raise DataError(f'{self.path}: no topic {topic}; topics here: {self._list_topics()}')
+        return self._counts.get(topic, sum(c.n_messages for c in self._topics[topic]))
 
     def pick_point_cloud_topic(self, topic: str | None = None) -> str:
         """Return `topic` if it has point clouds, or the only one that has; else a DataError."""
         clouds = self.point_cloud_topics
         if topic is not None:
-            if (msgtype := self.topic(topic).msgtype) != POINT_CLOUD2:
+            self.n_messages(topic)
+            if topic not in clouds:
                 raise DataError(
-                    f'{self.path}: topic {topic} is of type {msgtype}, must be {POINT_CLOUD2}; '
-                    f'such topics here: {", ".join(clouds) or "none"}'
+                    f'{self.path}: topic {topic} is of type {self._kind(topic)}, must be '
+                    f'{POINT_CLOUD2}; such topics here: {", ".join(clouds) or "none"}'
                 )
             clouds = [topic]
         recorded = [name for name in clouds if self.n_messages(name)]
@@ -198,62 +236,56 @@ class BagReader(AbstractContextManager['BagReader']):
         raise DataError(f'{self.path}: {problem}')
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, recorded time [ns] and CDR bytes of each message, of all topics by default.
+        """Topic, recorded time [ns] and CDR bytes of each message, by default of all in CDR.
 
         In order of their time; file after file in a split bag. Raises DataError if a topic is
-        unknown, the bag damaged, or its list of messages wrong.
+        unknown, of several types or not in CDR, the bag damaged, or its list of messages wrong.
         """
-        wanted = {name: self.topic(name) for name in (self._topics if topics is None else topics)}
-        for name, topic in wanted.items():
-            if topic.problem:
+        if topics is None:
+            topics = [name for name in self._topics if _is_readable(self._topics[name])]
+        expected = {name: self.n_messages(name) for name in topics}
+        for name in expected:
+            if not _is_readable(self._topics[name]):
                 raise DataError(
-                    f'{self.path}: topic {name} ({topic.msgtype}) has a message definition '
-                    f'that cannot be converted from ROS 1: {topic.problem}'
+                    f'{self.path}: topic {name} has messages of {self._kind(name)}; '
+                    'one topic must have one type, and be in CDR'
                 )
-        connections = [c for c in self._reader.connections if c.topic in wanted]
         found: Counter[str] = Counter()
-        source = iter(self._reader.messages(connections=connections) if connections else ())
-        while True:
-            # Errors of the caller, raised at the yield, must not pass through here.
-            with reading(self.path):
-                if (entry := next(source, None)) is None:
-                    break
-                connection, time, raw = entry
-                message = bytes(self._converters.get(connection.id, bytes)(raw))
-            found[connection.topic] += 1
-            yield connection.topic, time, message
-        for name, topic in wanted.items():
-            if found[name] != topic.n_messages:
+        for channels, read in self._storages:
+            wanted = [c for c in channels if c.topic in expected and not _is_foreign(c)]
+            names = {channel.key: channel.topic for channel in wanted}
+            for key, time, raw in self._read(read(names)) if names else ():
+                found[names[key]] += 1
+                yield names[key], time, raw
+        for name, n_messages in expected.items():
+            if found[name] != n_messages:
                 raise DataError(
-                    f'{self.path}: topic {name} lists {topic.n_messages} messages, '
+                    f'{self.path}: topic {name} lists {n_messages} messages, '
                     f'{found[name]} could be read; the bag is damaged, '
                     f'or its {METADATA_FILE} belongs to another one'
                 )
 
-    def _add(self, topic: BagTopic, n_messages: int) -> None:
-        """Add a topic, or another of its publishers."""
-        known = self._topics.setdefault(topic.name, topic)
-        if known.msgtype != topic.msgtype:
-            raise DataError(
-                f'{self.path}: topic {topic.name} has messages of two types, {known.msgtype} and '
-                f'{topic.msgtype}; one topic must have one type'
-            )
-        self._topics[topic.name] = dataclasses.replace(
-            known,
-            n_messages=known.n_messages + n_messages,
-            qos=tuple(dict.fromkeys((*known.qos, *topic.qos))),
-            problem=known.problem or topic.problem,
-        )
+    def _read(self, source: Iterator[tuple[int, int, bytes]]) -> Iterator[tuple[int, int, bytes]]:
+        """Messages of one file, unpacked; what goes wrong is a DataError."""
+        while True:
+            # Errors of the caller, raised at the yield, must not pass through here.
+            with reading(self.path):
+                if (entry := next(source, None)) is None:
+                    return
+                key, time, raw = entry
+                if self._is_packed:
+                    unpacker = require('zstandard', 'mcap').ZstdDecompressor()
+                    raw = unpacker.decompressobj().decompress(raw)
+            yield key, time, bytes(raw)
 
-    def _describe(self, connection: Any) -> BagTopic:
-        if self.storage != 'ros1':
-            return _ros2_topic(connection)
-        try:
-            topic, self._converters[connection.id] = _ros1_topic(connection)
-        except Exception as error:  # Reported when, and only if, the topic is read.
-            name, msgtype, problem = connection.topic, connection.msgtype, in_one_line(error)
-            return BagTopic(name, msgtype, '', UNKNOWN_TYPE_HASH, problem=problem)
-        return topic
+
+def _is_foreign(channel: _Channel) -> bool:
+    return channel.encoding != 'cdr'
+
+
+def _is_readable(channels: list[_Channel]) -> bool:
+    """Whether the messages of a topic are of one type in CDR."""
+    return len({c.msgtype for c in channels}) == 1 and not _is_foreign(channels[0])
 
 
 class BagWriter:
@@ -297,18 +329,22 @@ class BagWriter:
         """Give the bag its name, or remove it after an error."""
         self._open.__exit__(*error)
 
-    def add_topic(self, topic: BagTopic) -> None:
-        """Declare a topic, before its first message; raises `DataError` if it is there."""
-        if topic.name in self._connections:
-            raise DataError(f'{self.path}: topic {topic.name} twice')
+    def add_topic(self, name: str, msgtype: str = POINT_CLOUD2) -> None:
+        """Declare a topic of a type of ROS 2 Jazzy, before its first message; once.
+
+        It is offered reliably: with best effort, large clouds get lost when played.
+        """
+        from rosbags import interfaces as ros
+
+        if name in self._connections:
+            raise DataError(f'{self.path}: topic {name} twice')
+        forever = ros.QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
+        history, liveliness = ros.QosHistory.KEEP_LAST, ros.QosLiveliness.AUTOMATIC
+        kind = ros.QosReliability.RELIABLE, ros.QosDurability.VOLATILE
+        qos = ros.Qos(history, 10, *kind, forever, forever, liveliness, forever, False)
         with writing(self.path):
-            self._connections[topic.name] = self._writer.add_connection(
-                topic.name,
-                topic.msgtype,
-                msgdef=topic.definition,
-                rihs01=topic.type_hash,
-                serialization_format=topic.encoding,
-                offered_qos_profiles=topic.qos,
+            self._connections[name] = self._writer.add_connection(
+                name, msgtype, typestore=jazzy_types(), offered_qos_profiles=[qos]
             )
 
     def write(self, topic: str, time: int, raw: bytes | memoryview) -> None:

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import io
 import textwrap
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError, GroundSegError, PointCloudError, in_one_line
 from gp_ground_seg.data.clouds import (
@@ -21,6 +23,7 @@ from gp_ground_seg.data.clouds import (
     Fields,
     check_numbers,
     cloud_of,
+    coordinate_names,
     count_numbers,
     gather,
     name_columns,
@@ -51,14 +54,17 @@ def _fields_of(arrays: Columns) -> tuple[Fields, Columns]:
             raise PointCloudError(f'array of shape {table.shape}: must be (N, 3) or wider')
         table = name_columns(table)
     columns = {**({} if table is None else scatter(table.ravel())), **arrays}
-    shape = columns['x'].shape if 'x' in columns else ()
+    x = coordinate_names(columns)[0]
+    shape = columns[x].shape if x in columns else ()
     fields = {name: v for name, v in columns.items() if shape and v.shape[:1] == shape}
     return gather(fields), {name: v for name, v in columns.items() if name not in fields}
 
 
 def _table_name(arrays: Columns) -> str:
-    """Name of the table: `TABLE`, or, where no array is x, the only one that can be a table."""
-    if {TABLE, 'x'} & arrays.keys():
+    """Name of the table: none beside an array x, `TABLE`, or the only one that can be a table."""
+    if coordinate_names(arrays)[0] in arrays:
+        return ''
+    if TABLE in arrays:
         return TABLE
     tables = [name for name, v in arrays.items() if v.dtype.names or v.shape[1:] >= (3,)]
     if len(tables) != 1:
@@ -71,8 +77,14 @@ def _table_name(arrays: Columns) -> str:
 def _encode_npy(cloud: Cloud) -> bytes:
     """File of a structured array."""
     file = io.BytesIO()
-    np.save(file, cloud.fields)
+    _write_array(file, cloud.fields)
     return file.getvalue()
+
+
+def _write_array(file: IO[bytes], values: npt.NDArray[Any]) -> None:
+    """Write an ``.npy``, without numpy's warning that names beyond ASCII need numpy 1.17."""
+    is_ascii = ''.join(values.dtype.names or ()).isascii()
+    np.lib.format.write_array(file, values, None if is_ascii else (3, 0), allow_pickle=False)
 
 
 def _encode_npz(cloud: Cloud) -> bytes:
@@ -82,9 +94,12 @@ def _encode_npz(cloud: Cloud) -> bytes:
 
 
 def encode_arrays(arrays: Columns) -> bytes:
-    """File .npz of arrays by name."""
+    """File .npz of arrays by name; `numpy.savez` takes some names for its own arguments."""
     file = io.BytesIO()
-    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # any names
+    with zipfile.ZipFile(file, 'w', zipfile.ZIP_DEFLATED) as archive:
+        for name, values in arrays.items():
+            with archive.open(f'{name}.npy', 'w', force_zip64=True) as member:
+                _write_array(member, np.asarray(values))
     return file.getvalue()
 
 

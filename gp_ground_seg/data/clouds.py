@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import io
+import functools
 import math
-from collections.abc import Collection, Mapping
+import re
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.log import LOGGER
 
 Fields = npt.NDArray[np.void]
 Columns = dict[str, npt.NDArray[Any]]
@@ -19,6 +23,11 @@ COLUMNS = ('x', 'y', 'z', 'intensity')
 """Names of the first columns of a table without names; the others are column_5, ..."""
 MAX_NUMBERS = 1000
 """Numbers of a point that are accepted: a header can name more where there is no point."""
+_MAX_HEADER_BYTES = 1 << 16
+_COORDINATES = frozenset('xyzXYZ')
+_LONG = {'i8', 'u8'}
+_NO_NUMBER = re.compile(rb'[-+]?(nan\(\w+\)|1\.#(QNAN|SNAN|IND)\w*)', re.IGNORECASE)
+"""As Windows writes it."""
 
 
 @dataclass(frozen=True)
@@ -46,19 +55,35 @@ class Cloud:
 
     def join(self, columns: Columns) -> Cloud:
         """Return the cloud with further fields; one whose name is taken is called ``gp_NAME``."""
-        taken = self.fields.dtype.names or ()
-        new = {f'gp_{name}' if name in taken else name: v for name, v in columns.items()}
-        return replace(self, fields=gather({**scatter(self.fields), **new}))
+        joined = scatter(self.fields)
+        for name, values in columns.items():
+            while name in joined:
+                name = f'gp_{name}'
+            joined[name] = values
+        return replace(self, fields=gather(joined))
+
+
+def coordinate_names(names: Collection[str]) -> list[str]:
+    """Names of x, y and z, which some programs write as capitals."""
+    return [name if name in names else name.upper() for name in 'xyz']
+
+
+@functools.cache
+def note(text: str) -> None:
+    """Log it once, however many files it concerns."""
+    LOGGER.info(text)
 
 
 def cloud_of(fields: Fields, header: Any = None) -> Cloud:
     """Cloud of the points of a structured array; PointCloudError without numbers x, y, z."""
-    for name in 'xyz':
+    names = coordinate_names(fields.dtype.names or ())
+    for name in names:
         dtype = dict(fields.dtype.fields or {}).get(name, [np.dtype('V')])[0]
         if dtype.kind not in 'fiu':
             known = ', '.join(fields.dtype.names or ()) or 'none'
-            raise PointCloudError(f'no field {name} of one number per point; fields: {known}')
-    columns = [fields[name] for name in 'xyz']
+            wanted = name.lower()
+            raise PointCloudError(f'no field {wanted} of one number per point; fields: {known}')
+    columns = [fields[name] for name in names]
     is_single = all(column.dtype.kind == 'f' and column.itemsize <= 4 for column in columns)
     # A sensor's bytes may be a signalling NaN.
     with np.errstate(invalid='ignore'):
@@ -100,43 +125,131 @@ def count_numbers(dtype: np.dtype[Any]) -> int:
     return sum(math.prod(dtype[name].shape) for name in dtype.names or ())
 
 
+def distinct(names: Sequence[str], originals: Sequence[str] | None = None) -> list[str]:
+    """Return `names`, where one that is there already gets ``_2``, ``_3``, ... behind it.
+
+    A name that is equal to that of `originals` in its place goes before others. PointCloudError
+    for more than `MAX_NUMBERS`.
+    """
+    check_numbers(len(names))
+    pairs = list(zip(names, originals or names, strict=True))
+    first = {name for name, original in pairs if name == original}
+    found: dict[str, None] = {}
+    for name, original in pairs:
+        options = (name if k == 1 else f'{name}_{k}' for k in count(1))
+        free = (o for o in options if o not in found and (o == original or o not in first))
+        found[next(free)] = None
+    return list(found)
+
+
 def in_types(
     fields: Fields, accepted: Collection[str], format_name: str, flat: bool = False
 ) -> Fields:
     """Fields as a format can hold them, little-endian, without spaces in their names.
 
-    Bools become uint8 and half floats float32; where `flat`, a field ``a`` of several numbers
-    becomes fields ``a_0``, ``a_1``, ... Raises PointCloudError for a type that is not `accepted`.
+    Bools become uint8, half floats float32, and where there are no integers of 8 bytes float64 if
+    it holds them exactly; where `flat`, a field ``a`` of several numbers becomes fields ``a_0``,
+    ``a_1``, ... Names stay `distinct`. Raises PointCloudError for a type that is not `accepted`.
     """
-    columns = {}
+    originals: list[str] = []
+    names: list[str] = []
+    columns: list[npt.NDArray[Any]] = []
     for name, values in scatter(fields).items():
-        name = '_'.join(name.split())
         code = values.dtype.str[1:]
         code = {'b1': 'u1', 'f2': 'f4'}.get(code, code)
+        if code in _LONG - {*accepted} and np.abs(values.astype('f8')).max(initial=0.0) < 2**53:
+            code = 'f8'
         if code not in accepted:
             raise PointCloudError(f'field {name}: {format_name} has no type {values.dtype}')
         values = values.astype(f'<{code}')
+        word = '_'.join(name.split())
+        word = 'field' if word in ('', '_') else word  # _ is the padding of a PCD
+        parts = {word: values}
         if flat and values.ndim > 1:
-            table = values.reshape(len(values), int(np.prod(values.shape[1:])))
-            columns.update({f'{name}_{k}': table[:, k] for k in range(table.shape[1])})
-        else:
-            columns[name] = values
+            table = values.reshape(len(values), math.prod(values.shape[1:]))
+            parts = {f'{word}_{k}': table[:, k] for k in range(table.shape[1])}
+        originals += [name] * len(parts)
+        names += parts
+        columns += parts.values()
+    return gather(dict(zip(distinct(names, originals), columns, strict=True)))
+
+
+def split_header(data: bytes, last: str) -> tuple[list[str], bytes]:
+    """Lines of a header, with the `last`, known by its first word, and the bytes behind it.
+
+    As the first line ends, so do the others: with a line feed, or a carriage return alone.
+    """
+    head = data[:_MAX_HEADER_BYTES]
+    first = re.search(rb'\r?\n|\r', head)
+    end = r'\r' if first and first[0] == b'\r' else r'\r?\n'
+    line = rf'(?<![^\r\n]){last}\b[^\r\n]*{end}'.encode()
+    found = re.search(line, head, re.IGNORECASE)
+    if found is None:
+        raise PointCloudError(f'no {last} line of a header in it')
+    try:
+        text = head[: found.end()].decode('utf-8-sig')
+    except UnicodeDecodeError:
+        text = head[: found.end()].decode('latin-1')
+    return [line for line in re.split('[\r\n]+', text) if line.strip()], data[found.end() :]
+
+
+def check_size(n_bytes: int, n_points: int, needed: int) -> None:
+    """Raise PointCloudError if so many points of `needed` bytes are not in the file."""
+    if needed > n_bytes:
+        raise PointCloudError(
+            f'{n_bytes} bytes behind the header, which says {n_points} points '
+            f'(at least {needed} bytes); truncated?'
+        )
+
+
+def read_table(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
+    """Read the points behind a header; PointCloudError if there are fewer than it says."""
+    check_size(len(data), n_points, n_points * dtype.itemsize)
+    return np.frombuffer(data, dtype, n_points)
+
+
+def lines_of(data: bytes) -> list[bytes]:
+    """Lines of a text, without empty ones."""
+    return [line for line in data.splitlines() if line.strip()]
+
+
+def read_lines(lines: Sequence[bytes], dtype: np.dtype[Any], n_points: int) -> Fields:
+    """Read points of a text, one a line; PointCloudError if there are fewer than it should have.
+
+    An integer field that has other numbers becomes float64. A field beside x, y and z that has no
+    numbers is left out.
+    """
+    if len(lines) < n_points:
+        raise PointCloudError(f'{len(lines)} points, its header says {n_points}; truncated?')
+    check_numbers(count_numbers(dtype))
+    if n_points == 0:
+        return np.empty(0, dtype)
+    try:
+        return np.loadtxt(lines[:n_points], dtype, comments=None, ndmin=1)
+    except (ValueError, TypeError):
+        lines = [_NO_NUMBER.sub(b'nan', line) for line in lines[:n_points]]
+        if min(len(line.split()) for line in lines) < count_numbers(dtype):
+            raise
+    columns, stop = {}, 0
+    for name in dtype.names or ():
+        start, stop = stop, stop + math.prod(dtype[name].shape)
+        values = _read_column(lines, name, dtype[name].base, range(start, stop))
+        if values is not None:
+            columns[name] = values.reshape(-1, *dtype[name].shape)
     return gather(columns)
 
 
-def read_table(data: bytes, dtype: np.dtype[Any], n_points: int, is_text: bool) -> Fields:
-    """Read the points behind a header; PointCloudError if there are fewer than it says."""
-    # In a text each number takes two bytes, except the last.
-    needed = n_points * (2 * count_numbers(dtype) if is_text else dtype.itemsize) - is_text
-    if needed > len(data):
-        raise PointCloudError(
-            f'{len(data)} bytes behind the header, which says {n_points} points '
-            f'(at least {needed} bytes); truncated?'
-        )
-    if not (is_text and n_points):
-        return np.frombuffer(data, dtype, n_points)
-    text = io.BytesIO(data)
-    points: Fields = np.loadtxt(text, dtype, comments=None, max_rows=n_points, ndmin=1)
-    if len(points) != n_points:
-        raise PointCloudError(f'{len(points)} points, its header says {n_points}; truncated?')
-    return points
+def _read_column(
+    lines: Sequence[bytes], name: str, dtype: np.dtype[Any], used: range
+) -> npt.NDArray[Any] | None:
+    """Numbers of a field, (N, M), float64 if they are no such integers; None if no numbers."""
+    for kind in (dtype, np.dtype('f8')) if dtype.kind in 'iu' else (dtype,):
+        with suppress(ValueError, TypeError):
+            values = np.loadtxt(lines, kind, comments=None, usecols=used, ndmin=2)
+            if kind != dtype:
+                note(f'field {name}: has numbers that are no {dtype}; read as float64')
+            return values
+    if name in _COORDINATES:
+        raise PointCloudError(f'field {name}: has what is no number')
+    note(f'field {name}: has what is no number; left out')
+    return None

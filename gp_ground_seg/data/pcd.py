@@ -1,26 +1,35 @@
 """PCD files of the Point Cloud Library: text, binary and compressed are read, binary written.
 
-Why not pypcd4 1.5: it mixes up the numbers of a field of several in compressed files, returns
-fewer points than the header says from a file that is cut off, misreads padding, refuses headers
-without COUNT, and allocates whatever size a header names. Compressed files need the codec lzf.
+Why not pypcd4 1.5: it reads a third of what is read here of test/foreign_files.py, mixes up the
+numbers of a field of several in compressed files, and needs pydantic. Compressed files need the
+codec lzf.
 
 Source: https://pointclouds.org/documentation/tutorials/pcd_file_format.html, pcl/io/pcd_io.cpp.
 """
 
 from __future__ import annotations
 
-import re
 import struct
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError, require
-from gp_ground_seg.data.clouds import Cloud, Fields, gather, in_types, read_table
+from gp_ground_seg.data.clouds import (
+    Cloud,
+    Fields,
+    distinct,
+    gather,
+    in_types,
+    lines_of,
+    note,
+    read_lines,
+    read_table,
+    split_header,
+)
 
-_END = re.compile(rb'^DATA[ \t]+(\w+)[ \t]*\r?\n', re.MULTILINE)
-_MAX_HEADER_BYTES = 1 << 16
 _MAX_EXPANSION = 88  # of LZF: three bytes repeat 264 at most
+_SHAPE = ('WIDTH', 'HEIGHT', 'POINTS')
 _TYPES = {f'{kind}{n}' for kind in 'iu' for n in (1, 2, 4, 8)} | {'f4', 'f8'}
 
 
@@ -33,40 +42,66 @@ class PcdHeader(NamedTuple):
 
 
 def read_pcd(data: bytes) -> tuple[Fields, PcdHeader]:
-    """Read a file; PointCloudError if it cannot be one."""
-    end = _END.search(data[:_MAX_HEADER_BYTES])
-    if end is None:
-        raise PointCloudError('no DATA line of a PCD header in it')
-    lines = data[: end.start()].decode('ascii', 'replace').splitlines()
-    entries = {words[0]: words[1:] for words in map(str.split, lines) if words}
-    for key in ('FIELDS', 'SIZE', 'TYPE', 'WIDTH'):
-        if key not in entries:
-            raise PointCloudError(f'no {key} line in its header')
-    width, height = int(entries['WIDTH'][0]), int(entries.get('HEIGHT', '1')[0])
-    n_points = int(entries.get('POINTS', [str(width * height)])[0])
+    """Read a file; PointCloudError if it cannot be one.
+
+    Keys are read in capitals or not, COLUMNS as FIELDS, and what is not given is as PCL takes it:
+    float32 of one number, and one row.
+    """
+    lines, rest = split_header(data, 'DATA')
+    entries = {words[0].upper(): words[1:] for words in map(str.split, lines)}
+    names = entries.get('FIELDS') or entries.get('COLUMNS')
+    if not names:
+        raise PointCloudError('no FIELDS line in its header')
+    width, height = _shape_of(entries)
+    types = _types_of(names, entries)
+    form = ' '.join(entries['DATA']).lower()
+    if form == 'binary_compressed':
+        packed = np.dtype([entry for entry in types if not entry[0].startswith('_ ')])
+        fields = _read_compressed(rest, packed, width * height)
+    elif form == 'ascii':
+        fields = read_lines(lines_of(rest), np.dtype(types), width * height)
+    elif form == 'binary':
+        fields = read_table(rest, np.dtype(types), width * height)
+    else:
+        raise PointCloudError(f'DATA {form}: must be ascii, binary or binary_compressed')
+    kept = [name for name in fields.dtype.names or () if ' ' not in name]
+    viewpoint = ' '.join(entries.get('VIEWPOINT', PcdHeader().viewpoint.split()))
+    return gather({name: fields[name] for name in kept}), PcdHeader(width, height, viewpoint)
+
+
+def _shape_of(entries: dict[str, list[str]]) -> tuple[int, int]:
+    """Width and height of a header; PointCloudError if they contradict its number of points."""
+    given = {key: int(words[0]) for key, words in entries.items() if key in _SHAPE}
+    if not {'WIDTH', 'POINTS'} & given.keys():
+        raise PointCloudError('no WIDTH or POINTS line in its header')
+    height = given.get('HEIGHT', 1)
+    width = given['WIDTH'] if 'WIDTH' in given else given['POINTS'] // max(height, 1)
+    n_points = given.get('POINTS', width * height)
     if min(width, height) < 0 or n_points != width * height:
         raise PointCloudError(f'{n_points} points, which is not width {width} * height {height}')
+    return width, height
+
+
+def _types_of(names: list[str], entries: dict[str, list[str]]) -> list[tuple[str, str, Any]]:
+    """Name, type and shape of each field; what is left out has a space in its name."""
     types: list[tuple[str, str, Any]] = []
-    names = entries['FIELDS']
-    counts = map(int, entries.get('COUNT', ['1'] * len(names)))
-    for name, kind, size, count in zip(
-        names, entries['TYPE'], entries['SIZE'], counts, strict=True
-    ):
-        if (code := f'{kind.lower()}{size}') not in _TYPES:
+    defaults = {'TYPE': 'F', 'SIZE': '4', 'COUNT': '1'}
+    columns = [entries.get(key, [word] * len(names)) for key, word in defaults.items()]
+    if {*map(len, columns)} != {len(names)}:
+        pairs = zip(defaults, columns, strict=True)
+        counts = ', '.join(f'{len(column)} {key}' for key, column in pairs)
+        raise PointCloudError(f'{len(names)} FIELDS, but {counts}; spaces in a name?')
+    for name, kind, size, count in zip(distinct(names), *columns, strict=True):
+        code, shape = f'{kind.lower()}{size}', () if count == '1' else (int(count),)
+        if names[len(types)] == '_':
+            name = f'_ {len(types)}'
+        elif code not in _TYPES and name.lower() in ('x', 'y', 'z'):
             raise PointCloudError(f'field {name}: no type {kind} of {size} bytes')
-        unique = f'_ {len(types)}' if name == '_' else name
-        types.append((unique, f'<{code}', () if count == 1 else (count,)))
-    kept = [entry for entry in types if not entry[0].startswith('_ ')]
-    form, rest = end[1], data[end.end() :]
-    if form == b'binary_compressed':
-        fields = _read_compressed(rest, np.dtype(kept), n_points)
-    elif form in (b'ascii', b'binary'):
-        table = read_table(rest, np.dtype(types), n_points, form == b'ascii')
-        fields = gather({name: table[name] for name, *_ in kept})
-    else:
-        raise PointCloudError(f'DATA {form.decode()}: must be ascii, binary or binary_compressed')
-    viewpoint = ' '.join(entries.get('VIEWPOINT', PcdHeader().viewpoint.split()))
-    return fields, PcdHeader(width, height, viewpoint)
+        elif code not in _TYPES:
+            note(f'field {name}: no type {kind} of {size} bytes; left out')
+            name, code = f'{name} ', f'V{int(size)}'
+        types.append((name, f'<{code}', shape))
+    return types
 
 
 def _read_compressed(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:

@@ -22,7 +22,7 @@ from gp_ground_seg.core.errors import PointCloudError, in_one_line
 from gp_ground_seg.core.pipeline.points import finite_points
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
 from gp_ground_seg.data.bags import jazzy_types
-from gp_ground_seg.data.clouds import check_numbers, gather
+from gp_ground_seg.data.clouds import check_numbers, distinct, gather
 
 _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 _DATATYPE_NAMES = {datatype: np.dtype(code).name.upper() for datatype, code in _CODES.items()}
@@ -86,10 +86,10 @@ def read_fields(cloud: CloudMessage) -> npt.NDArray[np.void]:
     A field of several numbers is a sub-array. Raises PointCloudError as `read_xyz`, and if any
     field cannot be as it is described.
     """
-    layout: Any = {'names': [], 'formats': [], 'offsets': [], 'itemsize': cloud.point_step}
+    names = distinct([field.name for field in cloud.fields])
+    layout: Any = {'names': names, 'formats': [], 'offsets': [], 'itemsize': cloud.point_step}
     try:
         for field in cloud.fields:
-            layout['names'].append(field.name)
             # Some old writers leave count at 0 and mean 1.
             shape = () if field.count < 2 else (field.count,)
             layout['formats'].append((_code(cloud, field.datatype), shape))
