@@ -65,7 +65,7 @@ def test_declarations_are_complete(spec):
 
 
 def test_the_basic_parameters():
-    """Those in the table of README.md; changing this list changes what users see first."""
+    """Those at the top of docs/parameters.md; changing this list changes what users see first."""
     assert len(SPECS) == 69
     assert [spec.name for spec in SPECS if spec.basic] == [
         'sensor.height', 'sensor.roll', 'sensor.pitch', 'frame.level', 'frame.base',

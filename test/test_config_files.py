@@ -82,12 +82,13 @@ def test_generated_files_are_up_to_date():
     assert {f'config/{path.name}' for path in (REPOSITORY / 'config').glob('*.yaml')} <= set(files)
 
 
-def test_tables_have_a_row_for_each_parameter():
-    table = generate.to_markdown_table()
+@pytest.mark.parametrize('basic', [True, False])
+def test_tables_have_a_row_for_each_parameter(basic):
+    table = generate.to_markdown_table(basic=basic)
     header, rule, *rows = table.splitlines()
     assert set(rule) <= set('| -')
-    assert len(rows) == len(parameter_specs())
-    for row, spec in zip(rows, parameter_specs(), strict=True):
+    specs = [spec for spec in parameter_specs() if spec.basic == basic]
+    for row, spec in zip(rows, specs, strict=True):
         cells = row.replace(r'\|', '\0').split('|')
         assert len(cells) == len(header.split('|'))
         cells = [cell.strip().replace('\0', '|') for cell in cells[1:-1]]
@@ -95,15 +96,15 @@ def test_tables_have_a_row_for_each_parameter():
         assert yaml.safe_load(cells[1].strip('`')) == spec.default
         symbol = f'`{spec.symbol}`' if spec.symbol else ''
         assert cells[3:] == [spec.unit, symbol, spec.description]
-    # README.md has the basic ones, the page all of them.
-    marks = [*generate.marks_of(generate.PARAMETERS), *generate.marks_of(generate.SCORES)]
-    files = generate.generated_files(''.join(marks))
+
+
+def test_the_page_of_parameters_has_both_tables_and_what_is_gone():
+    files = generate.generated_files(''.join(generate.marks_of(generate.SCORES)))
     page, removed = files['docs/parameters.md'].split(generate.REMOVED_HEAD)
-    assert page.endswith(table)
+    first, others = page.split(generate.OTHERS_HEAD)
+    assert first.endswith(generate.to_markdown_table(basic=True))
+    assert others == generate.to_markdown_table(basic=False)
     assert removed.splitlines() == [f'| `{name}` | {use} |' for name, use in REMOVED.items()]
-    is_basic = [spec.basic for spec in parameter_specs()]
-    basic = [row for row, wanted in zip(rows, is_basic, strict=True) if wanted]
-    assert [row for row in files['README.md'].splitlines() if row.startswith('| `')] == basic
 
 
 @pytest.mark.parametrize('marks', ['', 'b', 'e', 'eb', 'bbe', 'bee'])

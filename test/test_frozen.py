@@ -21,7 +21,8 @@ SAME_P_GROUND = 1e-5
 SAME_HEIGHT = 1e-5
 """Difference of heights by the single precision of compiled code [m]."""
 MAX_LABELS_BY_NUMPY = 2
-"""Points of a frame that rounding labels differently in the two backends; README says so."""
+"""Points of a frame that rounding labels differently in the two backends, as docs/performance.md
+says."""
 
 
 def segmented(folder: Path, **changes: object) -> Iterator[tuple[str, Segmentation]]:

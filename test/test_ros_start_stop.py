@@ -148,6 +148,7 @@ def test_a_file_as_the_readme_has_it(tmp_path):
     blocks = re.findall(r'```sh\n(.*?)```', readme, re.DOTALL)
     (block,) = [block for block in blocks if 'config dump' in block]
     *commands, node_command = block.splitlines()
+    (tmp_path / 'demo_output').mkdir()  # made by `make demo`
     script = f'gp-ground-seg() {{ {sys.executable} -m gp_ground_seg "$@"; }}; set -e\n'
     command = ['bash', '-c', script + '\n'.join(commands)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -156,7 +157,7 @@ def test_a_file_as_the_readme_has_it(tmp_path):
     assert done.stdout.endswith(', 1 differs from the defaults\n')
     program, *words = node_command.split()
     assert program == 'gp-ground-seg'
-    words[words.index('my.yaml')] = str(tmp_path / 'my.yaml')
+    words[words.index('demo_output/my.yaml')] = str(tmp_path / 'demo_output' / 'my.yaml')
     words += ['-p', 'grid.n_bins:=55']
     with Process(*words, folder=tmp_path, start=('-m', 'gp_ground_seg')) as node:
         node.wait_until_ready()
