@@ -3,9 +3,8 @@
 from pathlib import Path
 
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.core.parameters.config import parameter_specs
+from gp_ground_seg.core.parameters.config import PRESETS, parameter_specs
 from gp_ground_seg.core.parameters.export import accepted_values, to_yaml, yaml_scalar
-from gp_ground_seg.core.parameters.presets import PRESETS
 from gp_ground_seg.core.parameters.removed import REMOVED
 
 ROOT = Path(__file__).resolve().parent.parent

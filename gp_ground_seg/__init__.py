@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from gp_ground_seg.core.parameters.config import Config
     from gp_ground_seg.core.result import Segmentation
     from gp_ground_seg.core.segmenter import GroundSegmenter
+    from gp_ground_seg.data import semantic_kitti
 
 __version__ = '0.3.0'
 
@@ -23,6 +24,7 @@ __all__ = [
     'PointCloudError',
     'Segmentation',
     '__version__',
+    'semantic_kitti',
 ]
 
 _MODULES = {
@@ -33,6 +35,7 @@ _MODULES = {
     'Label': 'core.frame',
     'PointCloudError': 'core.errors',
     'Segmentation': 'core.result',
+    'semantic_kitti': 'data.semantic_kitti',
 }
 
 
@@ -42,7 +45,8 @@ def __getattr__(name: str) -> object:
     """Import the module that defines `name`."""
     if name not in _MODULES:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    value = getattr(importlib.import_module(f'{__name__}.{_MODULES[name]}'), name)
+    module = importlib.import_module(f'{__name__}.{_MODULES[name]}')
+    value = getattr(module, name, module)
     globals()[name] = value
     return value
 

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from gp_ground_seg import Config, ConfigError
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters import export
-from gp_ground_seg.core.parameters.config import parameter_specs
+from gp_ground_seg.core.parameters.config import PRESETS, find_preset, parameter_specs
 from gp_ground_seg.core.parameters.export import file_problems
-from gp_ground_seg.core.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.core.parameters.removed import REMOVED
 
 GENERATE = 'run: make generate'

@@ -8,7 +8,7 @@ from evaluation_samples import scores_of, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.parameters.presets import PRESETS
+from gp_ground_seg.core.parameters.config import PRESETS
 from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab.experiments import ablation, interpolation, scenes, variants
 from gp_ground_seg.lab.experiments.ablation import MODELS

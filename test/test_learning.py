@@ -17,7 +17,7 @@ from gp_ground_seg.core.gp.learning import (
     theta_space,
 )
 from gp_ground_seg.core.jit import JIT_ENABLED
-from gp_ground_seg.core.parameters.presets import PRESETS
+from gp_ground_seg.core.parameters.config import PRESETS
 from gp_ground_seg.core.pipeline.lines import class_middles
 
 MODEL = NumbaBackend() if JIT_ENABLED else NumpyBackend()

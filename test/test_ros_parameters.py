@@ -18,9 +18,8 @@ from ros_helpers import bench, street, to_message
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
 from gp_ground_seg.core.jit import HAVE_NUMBA
-from gp_ground_seg.core.parameters.config import find_spec, parameter_specs
+from gp_ground_seg.core.parameters.config import PRESETS, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.export import file_problems
-from gp_ground_seg.core.parameters.presets import PRESETS
 from gp_ground_seg.core.parameters.removed import REMOVED
 from gp_ground_seg.ros.warm_up import CHANGED
 

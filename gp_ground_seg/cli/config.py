@@ -8,8 +8,7 @@ import sys
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import shown
 from gp_ground_seg.core.parameters import export
-from gp_ground_seg.core.parameters.config import Config, parameter_specs
-from gp_ground_seg.core.parameters.presets import find_preset
+from gp_ground_seg.core.parameters.config import Config, find_preset, parameter_specs
 from gp_ground_seg.core.parameters.schema import NO_VALUES, read_parameters
 
 EXAMPLES = """\

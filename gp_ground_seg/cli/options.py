@@ -17,9 +17,8 @@ from tqdm import tqdm
 from gp_ground_seg.core import log
 from gp_ground_seg.core.errors import ConfigError, DataError, shown
 from gp_ground_seg.core.jit import has_to_compile
-from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.parameters.config import PRESETS, Config, find_preset
 from gp_ground_seg.core.parameters.export import differences, yaml_scalar
-from gp_ground_seg.core.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.core.parameters.schema import load_yaml
 from gp_ground_seg.data.atomic_output import leftovers, staged_file
 from gp_ground_seg.data.inputs import Inputs, list_inputs

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.frame import (
+    BoolArray,
     Candidates,
     FloatArray,
     Frame,
@@ -24,6 +25,7 @@ from gp_ground_seg.core.frame import (
     usual_errors,
 )
 from gp_ground_seg.core.gp.learning import Learned, theta_names
+from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.core.pipeline.labels import ground_probability
 from gp_ground_seg.core.pipeline.relief import Relief
 from gp_ground_seg.core.pipeline.residuals import CorrectedSurface, correct_surface
@@ -130,7 +132,7 @@ class FitReport:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Segmentation:
     """A segmented scan; per-point arrays are in input order.
 
@@ -208,6 +210,23 @@ class Segmentation:
         for ground, and they are OBSTACLE. Points that are not finite are UNKNOWN.
         """
         return self.labelled.label
+
+    @property
+    def is_ground(self) -> BoolArray:
+        """Whether each point is GROUND, (N,)."""
+        is_ground: BoolArray = self.label == Label.GROUND
+        return is_ground
+
+    def __repr__(self) -> str:
+        """One line: a scan has too many numbers to print."""
+        n_ground, n_obstacle = (
+            in_thousands(np.count_nonzero(self.label == kind))
+            for kind in (Label.GROUND, Label.OBSTACLE)
+        )
+        return (
+            f'<Segmentation of {in_thousands(len(self.label))} points: {n_ground} ground, '
+            f'{n_obstacle} obstacle; origin {self.pose.height:.2f} m over the ground>'
+        )
 
     @property
     def margin(self) -> FloatArray:

@@ -10,9 +10,10 @@ import os
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from numbers import Real
-from typing import NoReturn
+from pathlib import Path
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +23,7 @@ from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_errors
 from gp_ground_seg.core.gp.learning import Learned
 from gp_ground_seg.core.jit import keep_code
-from gp_ground_seg.core.parameters.config import Config, SensorConfig
+from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
 from gp_ground_seg.core.pipeline.mirror_images import MirrorImages, find_mirror_images
 from gp_ground_seg.core.pipeline.points import take_points
@@ -46,27 +47,34 @@ class GroundSegmenter:
 
     Parameters
     ----------
-    config : Config
-        Parameters; `configure` changes them between scans.
+    config : Config, str, Path, dict or None
+        Parameters; name of a preset; YAML file (a word with its suffix, or a Path); values by
+        dotted name; None for the defaults. `configure` changes them between scans.
     clock : callable
         Source of the seconds in ``Segmentation.timings``.
     backend : Backend, optional
         Backend to use until the parameters ``runtime`` change; by default one made from them.
+    **parameters
+        Further values, by name with ``_`` in place of the dot: ``sensor_height=1.73``.
 
     Raises
     ------
+    ConfigError
+        If a name is unknown, or a value is not accepted.
     MissingDependencyError
         If ``runtime.backend`` is numba and numba is not installed.
     """
 
     def __init__(
         self,
-        config: Config | None = None,
+        config: Config | str | Path | Mapping[str, Any] | None = None,
+        *,
         clock: Callable[[], float] = time.perf_counter,
         backend: Backend | None = None,
+        **parameters: Any,
     ) -> None:
         self._clock = clock
-        self._config = config if config is not None else Config()
+        self._config = config_of(config, **parameters)
         self._backend = make_backend(self._config.runtime) if backend is None else backend
         self._sample_backend: Backend | None = None
         self._warned: set[str] = set()

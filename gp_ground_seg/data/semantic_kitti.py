@@ -12,10 +12,15 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.frame import BoolArray
 from gp_ground_seg.data.files import read_bytes
 from gp_ground_seg.data.scan_layout import KITTI_COLUMNS, four_columns, read_scan
 
 _LOGGER = logging.getLogger('gp_ground_seg')
+UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70
+"""Classes that say neither ground nor obstacle."""
+GROUND_CLASSES = (40, 44, 48, 49, 60, 72)
+"""Road, parking, sidewalk, other ground, lane marking, terrain."""
 FRAME_PERIOD = 0.1  # time between frames [s] where a sequence has no times.txt
 _MAX_TIMES_BYTES = 1 << 24
 
@@ -34,6 +39,41 @@ class Frame:
     def __str__(self) -> str:
         """Sequence and index."""
         return f'{self.sequence}/{self.index}'
+
+    @property
+    def points(self) -> npt.NDArray[np.float32]:
+        """Points x, y, z [m], intensity, (N, 4); raises DataError as `read_points`."""
+        return read_points(self.points_path, self.columns)
+
+    @property
+    def semantic(self) -> npt.NDArray[np.uint16]:
+        """Class of each point, (N,); DataError without a file of labels that fits."""
+        if self.labels_path is None:
+            raise DataError(f'{self.points_path}: has no labels')
+        n_points = self.points_path.stat().st_size // (4 * self.columns)
+        return read_labels(self.labels_path, n_points)
+
+    @property
+    def is_ground(self) -> BoolArray:
+        """Whether each point is labelled as ground, (N,): `GROUND_CLASSES`."""
+        return np.isin(self.semantic, GROUND_CLASSES)
+
+    @property
+    def is_scored(self) -> BoolArray:
+        """Whether the label of each point counts, (N,): not without one, outlier, vegetation.
+
+        The convention of GroundGrid (Steinke et al., RA-L 2024), as `evaluate` has it first.
+        """
+        return ~np.isin(self.semantic, (UNLABELLED, OUTLIER, VEGETATION))
+
+
+def frames(root: str | Path, *sequences: str) -> list[Frame]:
+    """Frames of sequences, as in '02', by default of all, in order; DataError if there are none.
+
+    Points and labels of a frame are read each time they are asked for, and not kept.
+    """
+    chosen = sequences or list_sequences(root)
+    return [frame for name in chosen for frame in list_frames(root, name)]
 
 
 def list_sequences(root: str | Path) -> list[str]:

@@ -1,23 +1,27 @@
-"""The one declaration of every parameter.
+"""The one declaration of every parameter, and the named sets of them.
 
 YAML files, ROS parameter descriptors, command-line ``--set`` options and the tables of
-README.md and docs/parameters.md are derived from the dataclasses below. Why not pydantic or
+docs/parameters.md are derived from the dataclasses below. Why not pydantic or
 `generate_parameter_library`: one has no ROS descriptors, the other needs ROS to build.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
 
 from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.parameters.schema import (
     AUTO,
     ParameterGroups,
     ParameterSpec,
+    ParameterValue,
     advanced,
     basic,
+    did_you_mean,
 )
 
 NO_FRAME = 'none'
@@ -315,6 +319,11 @@ class Config(ParameterGroups):
         _check_bins(self.grid)
         _check_memory(self)
 
+    @classmethod
+    def preset(cls, name: str) -> Config:
+        """Return the preset `name`, ``default`` or ``paper``; ConfigError for another."""
+        return find_preset(name).config
+
 
 def _check_bins(grid: GridConfig) -> None:
     # Bins widen with range: the first one is the narrowest.
@@ -351,3 +360,111 @@ def parameter_specs() -> tuple[ParameterSpec, ...]:
 
 
 find_spec = Config.find_spec
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A named set of parameters; `name` is that of its file in ``config/`` too."""
+
+    name: str
+    purpose: str
+    overrides: dict[str, tuple[ParameterValue, str]] = field(default_factory=dict)
+    """Values that differ from the defaults, each with the reason, by name."""
+
+    @property
+    def config(self) -> Config:
+        """The defaults with the overrides."""
+        return Config().replace(**{name: value for name, (value, _) in self.overrides.items()})
+
+    @property
+    def title(self) -> str:
+        """First line of its file."""
+        return f'Preset {self.name}: {self.purpose}'
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Reason of each override by the name of its parameter."""
+        return {name: reason for name, (_, reason) in self.overrides.items()}
+
+
+_PRESETS = (
+    Preset('default', 'For all sensors; chosen on labelled KITTI frames and simulated scans.'),
+    Preset(
+        'paper',
+        'What arXiv 2112.05847 prints, learned until it converges. Of our departures '
+        '(docs/algorithm.md) it has the three without a switch: latent values are centred on '
+        'their mean in each segment, heights between bin edges are linear, and points without '
+        'a model are obstacles. What the paper leaves open is as in the defaults.',
+        {
+            'sensor.height': (1.73, "of KITTI's sensor, the paper's data"),
+            'sensor.roll': (0.0, 'nothing is levelled'),
+            'sensor.pitch': (0.0, 'nothing is levelled'),
+            'grid.n_segments': (180, 'M in section IV'),
+            'grid.n_bins': (120, 'N in section IV'),
+            'grid.r_max': (90.0, 'not printed: 120 bins of 0.73 m'),
+            'grid.bin_growth': (1.0, 'bins of equal width'),
+            'lines.slope_tolerance': (0.02, 'zeta_m in section IV'),
+            'lines.offset_tolerance': (0.15, 'zeta_b in section IV'),
+            'lines.max_gap_growth': (0.15, "not printed; chosen for the rings of KITTI's sensor"),
+            'length_scale.model': ('latent', 'section III-B'),
+            'observation.slope_std': (0.0, 'the equations have a level mean'),
+            'surface.look_aside': (False, 'each segment has a surface of its own'),
+            'growth.max_std': (0.4, 'not printed; chosen for segments by themselves'),
+            'growth.max_standardised_residual': (2.0, 'a gate alike above and below'),
+            'growth.max_standardised_depth': (2.0, 'a gate alike above and below'),
+            'growth.max_line_slope': (0.0, 'the gate alone decides'),
+            'growth.min_bend_extent': (1000.0, 'the gate alone decides'),
+            'faces.max_normal_z': (0.0, 'no faces'),
+            'faces.max_foot_distance': (0.0, 'no faces'),
+            'label.ground_tolerance': (0.2, 'zeta_g, not printed: one for all'),
+            'label.rule': ('tolerance', 'one zeta_g for all (Algorithm 2)'),
+            'learning.objective': ('paper', 'section III-E as printed'),
+            'learning.fixed': ('none', 'all hyper-parameters are learned, section III-E'),
+            'learning.length_scale': ('classes', 'all segments share L_bar, section III-E'),
+            'learning.max_evaluations': (1000, 'learning ends by itself before'),
+            'learning.segment_step': (1, 'theta is learned from every segment, section III-E'),
+        },
+    ),
+)
+PRESETS = {preset.name: preset for preset in _PRESETS}
+"""Every preset by its name."""
+
+
+def find_preset(name: str) -> Preset:
+    """Return the preset `name`; raises ConfigError with the nearest one and all others."""
+    preset = PRESETS.get(name)
+    if preset is None:
+        hint = did_you_mean(name, PRESETS)
+        raise ConfigError(f'unknown preset {name!r}{hint} (there are {", ".join(PRESETS)})')
+    return preset
+
+
+def config_of(given: Config | str | Path | Mapping[str, Any] | None, **values: Any) -> Config:
+    """Return parameters by whatever names them.
+
+    Parameters
+    ----------
+    given : Config, str, Path, dict or None
+        Parameters themselves; the name of a preset; a YAML file, as a word with its suffix too;
+        values by dotted name; or None for the defaults.
+    **values
+        Further values, by name with ``_`` in place of the dot: ``sensor_height=1.73``.
+
+    Raises
+    ------
+    ConfigError
+        If a name is unknown, a value is not accepted, or the file cannot be read.
+    """
+    if isinstance(given, Config):
+        config = given
+    elif given is None or isinstance(given, Mapping):
+        config = Config().replace(**{**given} if given else {})
+    elif isinstance(given, Path) or str(given).endswith(('.yaml', '.yml')):
+        config = Config.from_yaml(given)
+    else:
+        config = find_preset(str(given)).config
+    names = {spec.name.replace('.', '_'): spec.name for spec in parameter_specs()}
+    if unknown := [name for name in values if name not in names]:
+        hint = did_you_mean(unknown[0], names)
+        raise ConfigError(f'unknown parameter {unknown[0]}{hint}')
+    return config.replace(**{names[name]: value for name, value in values.items()})

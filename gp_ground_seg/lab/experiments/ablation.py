@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from gp_ground_seg.core.errors import ConfigError
-from gp_ground_seg.core.parameters.config import Config, find_spec
-from gp_ground_seg.core.parameters.presets import find_preset
+from gp_ground_seg.core.parameters.config import Config, find_preset, find_spec
 from gp_ground_seg.lab.experiments.interpolation import interpolation_method
 from gp_ground_seg.lab.experiments.variants import Changes, refuse_changed, score_variants
 from gp_ground_seg.lab.scale.cluster import HERE, Runner

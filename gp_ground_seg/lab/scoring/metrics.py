@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import FloatArray, IntArray, Label
+from gp_ground_seg.data.semantic_kitti import GROUND_CLASSES, OUTLIER, UNLABELLED, VEGETATION
 
 Labels = npt.NDArray[np.uint8]
 
@@ -47,9 +48,6 @@ SENSOR_HEIGHT = 1.73
 it must not move with ``sensor.height``, which is a parameter of the method."""
 LOW_VEGETATION_Z = -0.75 * SENSOR_HEIGHT
 """Height [m, sensor frame] below which Patchwork's evaluation counts vegetation as ground."""
-
-UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70
-GROUND_CLASSES = (40, 44, 48, 49, 60, 72)
 
 
 @dataclass(frozen=True)

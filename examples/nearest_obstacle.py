@@ -1,0 +1,43 @@
+"""Print the nearest obstacle of each cloud that the node publishes.
+
+Beside `gp-ground-seg node --ros-args -r points:=YOUR_TOPIC -p output.min_height:=0.2`, start
+this with -r /obstacles:=NAME if the node has a namespace.
+"""
+
+import numpy as np
+import rclpy
+from rclpy.node import Node
+from sensor_msgs.msg import PointCloud2
+
+from gp_ground_seg.data.point_cloud2 import read_xyz
+
+
+class NearestObstacle(Node):
+    """Subscribes to ``obstacles``."""
+
+    def __init__(self):
+        super().__init__('nearest_obstacle')
+        self.create_subscription(PointCloud2, 'obstacles', self.on_cloud, 5)
+
+    def on_cloud(self, cloud):
+        """Log range and bearing of the nearest point."""
+        x, y, _ = read_xyz(cloud).T
+        if len(x):
+            nearest = np.argmin(np.hypot(x, y))
+            reach, bearing = np.hypot(x, y)[nearest], np.degrees(np.arctan2(y, x)[nearest])
+            self.get_logger().info(f'{reach:.2f} m away, {bearing:.0f} degrees to the left')
+
+
+def main():
+    """Run until Ctrl-C."""
+    rclpy.init()
+    try:
+        rclpy.spin(NearestObstacle())
+    except KeyboardInterrupt:
+        pass
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    main()
