@@ -36,7 +36,8 @@ $(VENV)/.ros: setup.py $(VENV)/.python
 	@touch $@
 
 $(VENV)/.dev: setup.py $(VENV)/.ros
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ros,dev]'
+	@echo 'Installing what the tests need into $(VENV) (about 100 MB) ...'
+	@$(BIN)/python scripts/install_with_progress.py 100 -e '.[ros,dev]'
 	@touch $@
 
 $(VENV)/.docs: setup.py $(VENV)/.dev
