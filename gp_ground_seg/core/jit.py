@@ -83,7 +83,7 @@ def compiled_form(
     return decorate
 
 
-def _options(fastmath: bool) -> dict[str, Any]:
+def _options(fastmath: bool = False) -> dict[str, Any]:
     # No function is handed to C, and a wrapper for it takes a tenth of the time to compile.
     options: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
     if fastmath:
@@ -120,13 +120,14 @@ def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _
         while _shared:
             plain = _shared.pop()
             compiled_form(plain)(plain)
-        options = _options(fastmath)
         if part:
-            options['inline'] = 'always'
+            inlined: _Function = numba.njit(inline='always')(function)
+            return inlined
         if not entry:
-            inner: _Function = numba.njit(**options)(function)
-            return inner
-        compiled: _Function = _njit_kept(function, options)
+            # Without a wrapper for Python, which takes a tenth of the time to compile: there the
+            # function stays plain.
+            return compiled_form(function, fastmath=fastmath)(function)
+        compiled: _Function = _njit_kept(function, _options())
         _entry_points.append(compiled)
         return compiled
 
