@@ -39,6 +39,7 @@ from gp_ground_seg.core.frame import (
 from gp_ground_seg.core.gp.evidence import CLEARLY, ODDS, STEP, looks_aside_in
 from gp_ground_seg.core.gp.latent import given_log_length_scales
 from gp_ground_seg.core.gp.learning import Learned, given_theta, theta_space
+from gp_ground_seg.core.gp.search import search_from
 from gp_ground_seg.core.jit import announce_compiling, keep_code
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.number_tuples import numbers_of
@@ -149,6 +150,7 @@ class NumbaBackend:
             config.length_scale.model == 'latent',
             ODDS if config.label.rule == 'roughness' else 0.0,
             alone,
+            search_from(theta, space.lower.copy(), space.upper.copy()),
             theta,
             outcome,
         )

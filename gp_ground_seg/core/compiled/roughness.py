@@ -71,8 +71,9 @@ def set_roughness(
 @jit()
 def _known_levels(tiles: Tiles, sums: IntArray, units: float) -> tuple[CellArray, CellArray, int]:
     """Tiles with a return near the surface, the level of each (K,), and the median of these."""
-    counts, n_known = np.zeros(N_LEVELS, np.int32), 0
-    known, level = np.empty((2, len(tiles.occupied)), np.int32)
+    counts, n_known = np.zeros(N_LEVELS, np.int64), 0
+    n = len(tiles.occupied)
+    known, level = np.empty(n, np.int32), np.empty(n, np.int32)
     for tile in tiles.occupied:
         number = sums[np.uintp(tile), 0]
         if number > 0:
@@ -83,7 +84,7 @@ def _known_levels(tiles: Tiles, sums: IntArray, units: float) -> tuple[CellArray
             known[n_known], level[n_known] = tile, found
             counts[found] += 1
             n_known += 1
-    return known[:n_known], level[:n_known], _level_at(counts, 0.5)
+    return known[:n_known], level[:n_known], _level_at(counts, n_known, 0.5)
 
 
 @jit()
@@ -101,7 +102,7 @@ def _levels_about(
     # Blocks in a square with one more at each side, so that each has eight around it.
     width = (n_sides - 1 >> shift) + 3
     block_to_row[: width * width] = 0
-    own, row_to_block = np.empty((2, len(tile) + 1), np.int32)
+    own, row_to_block = np.empty(len(tile) + 1, np.int32), np.empty(len(tile) + 1, np.int32)
     for k in range(len(tile)):
         column = tile[k] // n_sides
         row = tile[k] - column * n_sides
@@ -131,9 +132,9 @@ def _levels_about(
 
 
 @jit()
-def _level_at(counts: CellArray, share: float) -> int:
-    """Level that a `share` of the tiles, counted by level, does not exceed; 0 without any."""
-    most, cumulative, level = share * (counts.sum() - 1), counts[0], 0
+def _level_at(counts: IntArray, n: int, share: float) -> int:
+    """Level that a `share` of `n` tiles, counted by level, does not exceed; 0 without any."""
+    most, cumulative, level = share * (n - 1), counts[0], 0
     while cumulative <= most:
         level += 1
         cumulative += counts[np.uintp(level)]
