@@ -101,7 +101,8 @@ def _levels_about(
     shift, n_rows = window.shift, 1
     # Blocks in a square with one more at each side, so that each has eight around it.
     width = (n_sides - 1 >> shift) + 3
-    block_to_row[: width * width] = 0
+    for block in range(width * width):
+        block_to_row[block] = 0
     own, row_to_block = np.empty(len(tile) + 1, np.int32), np.empty(len(tile) + 1, np.int32)
     for k in range(len(tile)):
         column = tile[k] // n_sides
@@ -113,12 +114,14 @@ def _levels_about(
         own[k] = block_to_row[block]
     # Row 0 is that of blocks without such a tile. One dimension, as views of rows take longer than
     # the sums.
-    counts[: n_rows * N_WORDS] = 0
+    for w in range(n_rows * N_WORDS):
+        counts[w] = 0
     for k in range(len(tile)):
         counts[np.uintp(own[k] * N_WORDS + level[k] // 8)] += _byte(1, level[k])
     about, level_of_row = np.empty(N_WORDS, np.uint64), np.empty(n_rows, np.int32)
     for n in range(1, n_rows):
-        about[:] = 0
+        for w in range(N_WORDS):
+            about[w] = 0
         about[of_frame // 8] = _byte(window.prior, of_frame)
         for step in range(-width, width + 1, width):
             for beside in range(row_to_block[n] + step - 1, row_to_block[n] + step + 2):
