@@ -109,8 +109,9 @@ def _take_inliers(frame: Frame, step: int, has_latent: bool, alone: SegmentSurfa
     kind = np.empty(most_bar, np.int64)
     n_used = (n_segments + step - 1) // step
     offsets, bar_offsets = np.empty(n_used + 1, np.int64), np.empty(n_used + 1, np.int64)
-    n = p = k = offsets[0] = bar_offsets[0] = 0
-    for m in range(0, n_segments, step):
+    n = p = offsets[0] = bar_offsets[0] = 0
+    for k in range(n_used):
+        m = k * step
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
             if alone.inlier[c]:
                 r[n], z[n] = candidates.r[c], candidates.z[c] - frame.prior_mean
@@ -121,8 +122,7 @@ def _take_inliers(frame: Frame, step: int, has_latent: bool, alone: SegmentSurfa
                 r_bar[p], log_extent[p] = pseudo.r_bar[c], pseudo.log_extent[c]
                 kind[p] = pseudo.kind[c]
                 p += 1
-        k += 1
-        offsets[k], bar_offsets[k] = n, p
+        offsets[k + 1], bar_offsets[k + 1] = n, p
     return Inliers(offsets, r[:n], z[:n], u[:n], bar_offsets, r_bar, log_extent, kind)
 
 

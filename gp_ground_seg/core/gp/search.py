@@ -44,7 +44,8 @@ class Search(NamedTuple):
 def search_from(x: FloatArray, lower: FloatArray, upper: FloatArray) -> Search:
     """Begin at `x`, within the bounds: the first trial."""
     d = len(x)
-    search = Search(lower, upper, *np.empty((4, d)), np.empty((d, d)), np.empty(2))
+    at, gradient, trial, turned = np.empty((4, d))
+    search = Search(lower, upper, at, gradient, trial, turned, np.empty((d, d)), np.empty(2))
     begin(search, x)
     return search
 
