@@ -94,7 +94,8 @@ def _options(fastmath: bool = False) -> dict[str, Any]:
 def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _Decorator:
     """Return a decorator that compiles a function where numba is installed.
 
-    Compiled functions release the interpreter's lock.
+    Compiled functions release the interpreter's lock. One that is neither `entry` nor `part` runs
+    as plain Python where Python calls it.
 
     Parameters
     ----------
@@ -108,8 +109,8 @@ def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _
         returns numbers, or nothing: numba runs Python to return arrays and named tuples, where
         Ctrl-C ends in a SystemError or a crash.
     part : bool
-        Whether it is called in one place, as a part of a long kernel: compiled there, and not by
-        itself first, which takes twice as long.
+        Whether it is called in one place, as a part of a kernel: compiled there, and not by itself
+        first. Of many lines that takes longer.
     """
 
     def decorate(function: _Function) -> _Function:
