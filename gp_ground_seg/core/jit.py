@@ -83,7 +83,7 @@ def compiled_form(
     return decorate
 
 
-def _options(fastmath: bool) -> dict[str, Any]:
+def _options(fastmath: bool = False) -> dict[str, Any]:
     # No function is handed to C, and a wrapper for it takes a tenth of the time to compile.
     options: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
     if fastmath:
@@ -94,7 +94,8 @@ def _options(fastmath: bool) -> dict[str, Any]:
 def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _Decorator:
     """Return a decorator that compiles a function where numba is installed.
 
-    Compiled functions release the interpreter's lock.
+    Compiled functions release the interpreter's lock. One that is neither `entry` nor `part` runs
+    as plain Python where Python calls it.
 
     Parameters
     ----------
@@ -108,8 +109,8 @@ def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _
         returns numbers, or nothing: numba runs Python to return arrays and named tuples, where
         Ctrl-C ends in a SystemError or a crash.
     part : bool
-        Whether it is called in one place, as a part of a long kernel: compiled there, and not by
-        itself first, which takes twice as long.
+        Whether it is called in one place, as a part of a kernel: compiled there, and not by itself
+        first. Of many lines that takes longer.
     """
 
     def decorate(function: _Function) -> _Function:
@@ -120,13 +121,14 @@ def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _
         while _shared:
             plain = _shared.pop()
             compiled_form(plain)(plain)
-        options = _options(fastmath)
         if part:
-            options['inline'] = 'always'
+            inlined: _Function = numba.njit(inline='always')(function)
+            return inlined
         if not entry:
-            inner: _Function = numba.njit(**options)(function)
-            return inner
-        compiled: _Function = _njit_kept(function, options)
+            # Without a wrapper for Python, which takes a tenth of the time to compile: there the
+            # function stays plain.
+            return compiled_form(function, fastmath=fastmath)(function)
+        compiled: _Function = _njit_kept(function, _options())
         _entry_points.append(compiled)
         return compiled
 

@@ -63,7 +63,7 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
     """Set the lowest points, and those behind them to count for nothing; return their number."""
     offsets, r, z = candidates.offsets, candidates.r, candidates.z
     n_segments = len(offsets) - 1
-    cell_of, starts = np.empty(len(r), dtype=np.int16), np.zeros(N_CELLS + 1, dtype=np.int64)
+    cell_of, starts = np.empty(len(r), np.int64), np.zeros(N_CELLS + 1, np.int64)
     for m in range(n_segments):
         first = (m * N_SECTORS // n_segments) * N_RINGS
         for c in range(offsets[m], offsets[m + 1]):
@@ -75,8 +75,10 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
     for cell in range(N_CELLS):
         starts[cell + 1] += starts[cell]
     # Candidates cell by cell, in order of their segments.
-    members, homes = np.empty((2, starts[N_CELLS]), dtype=np.int64)
-    ends = starts[:N_CELLS].copy()
+    members, homes = np.empty(starts[N_CELLS], np.int64), np.empty(starts[N_CELLS], np.int64)
+    ends = np.empty(N_CELLS, np.int64)
+    for cell in range(N_CELLS):
+        ends[cell] = starts[cell]
     for m in range(n_segments):
         for c in range(offsets[m], offsets[m + 1]):
             if cell_of[c] >= 0:
@@ -158,8 +160,9 @@ def refutation_of(plane: Plane, cells: LowestPoints, n: int, origin: Direction) 
     """Weight of the rays from `origin` that cross a plane where it should have stopped them."""
     x, y, z = origin
     clearance, total = max(distance(x, y, z, plane), 0.0), 0.0
-    is_seen, reach = np.zeros(N_CELLS, dtype=np.bool_), np.full(N_SECTORS, LEAST_REACH)
-    heights = np.empty(n)
+    is_seen, reach, heights = np.zeros(N_CELLS, np.bool_), np.empty(N_SECTORS), np.empty(n)
+    for sector in range(N_SECTORS):
+        reach[sector] = LEAST_REACH
     for c in range(n):
         heights[c] = distance(cells.x[c], cells.y[c], cells.z[c], plane)
         if abs(heights[c] * cells.inverse[c]) < 1.0:
@@ -170,7 +173,9 @@ def refutation_of(plane: Plane, cells: LowestPoints, n: int, origin: Direction) 
             sector = cells.cell[c] // N_RINGS
             crossing = crossed_at(cells.r[c], heights[c], clearance)
             if crossing < reach[sector]:
-                ring = np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
+                ring = 0
+                while ring < N_RINGS - 1 and crossing >= RING_EDGES[ring + 1]:
+                    ring += 1
                 if not is_seen[sector * N_RINGS + ring]:
                     total += refutation_by(crossing)
     return total

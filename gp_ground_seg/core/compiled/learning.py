@@ -1,4 +1,7 @@
-"""Compiled twin of `gp_ground_seg.core.gp.learning`: all rounds of a frame in one call."""
+"""Compiled twin of `gp_ground_seg.core.gp.learning`.
+
+A round is a call of its own: in one with the growth, that would be compiled a second time.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,9 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.core.compiled.ground import SegmentSurfaces, grow_surfaces
-from gp_ground_seg.core.compiled.latent import latent_log_length_scales
+from gp_ground_seg.core.compiled.ground import SegmentSurfaces
 from gp_ground_seg.core.compiled.likelihood import log_likelihood
-from gp_ground_seg.core.frame import FloatArray, Frame, Inliers, IntArray
+from gp_ground_seg.core.frame import FloatArray, Frame, Inliers
 from gp_ground_seg.core.gp.evidence import is_low_and_near
 from gp_ground_seg.core.gp.learning import (
     BUDGET,
@@ -21,56 +23,50 @@ from gp_ground_seg.core.gp.learning import (
     missed_by_line,
     slope_of_prior,
 )
-from gp_ground_seg.core.gp.search import propose, search_from, take_outcome
+from gp_ground_seg.core.gp.search import Search, begin, propose, take_outcome
 from gp_ground_seg.core.jit import jit
-from gp_ground_seg.core.parameters.config import GrowthConfig, LearningConfig, ObservationConfig
+from gp_ground_seg.core.parameters.config import GrowthConfig
 
 
 @jit(entry=True)
-def learn_frame(
+def begin_learning(
+    frame: Frame, growth: GrowthConfig, step: int, alone: SegmentSurfaces, theta: FloatArray
+) -> None:
+    """Set the first theta (T,), which holds the given values, and the seeds."""
+    _set_first_theta(frame, growth, theta)
+    _set_seeds(frame, growth, step, alone)
+
+
+@jit(entry=True)
+def learn_round(
     frame: Frame,
     space: ThetaSpace,
-    observation: ObservationConfig,
-    growth: GrowthConfig,
-    learning: LearningConfig,
+    slope_std: float,
     is_map: bool,
-    is_latent: bool,
-    odds: float,
+    step: int,
+    least: int,
+    max_evaluations: int,
     alone: SegmentSurfaces,
+    search: Search,
     theta: FloatArray,
     outcome: FloatArray,
 ) -> int:
-    """Do what the twin does, into `theta` (T,), which holds the given values.
+    """Learn theta (T,) on the inliers of every `step`-th segment; return how many evaluations.
 
-    The frame has no knots. `is_map` and `is_latent` are the objective and the model of the
-    length-scale, `odds` as of `grow_surfaces`; `alone` has no knots, and the log length-scales at
-    the candidates if these are given. Sets `outcome` (2,) to the objective and the place of the
-    status in `STATUSES`, and returns the number of evaluations.
+    Returns -1 if there are fewer inliers than `least`. Sets `outcome` (3,) to the objective, the
+    place of the status in `STATUSES`, and the number of inliers. `is_map` is the objective.
     """
-    _set_first_theta(frame, growth, theta)
-    free, step, nothing = np.flatnonzero(space.free), learning.segment_step, np.empty((2, 0, 0))
-    has_latent = len(free) > 0 and free[len(free) - 1] >= 2
-    outcome[0], outcome[1] = -math.inf, BUDGET
-    n_rounds = n_before = n_evaluations = 0
-    budget = max(learning.max_evaluations // 2, 1)
-    while budget > 0:
-        if is_latent:
-            at_knots = alone.knot_log_length_scale
-            latent_log_length_scales(frame, theta, step, alone.log_length_scale, at_knots)
-        _set_seeds(frame, growth, step, alone)
-        grow_surfaces(frame, theta, observation, growth, odds, nothing, step, alone)
-        inliers = _take_inliers(frame, step, has_latent, alone)
-        n_rounds += 1
-        if n_rounds > 2 and len(inliers.r) <= n_before:
-            break
-        n_before = len(inliers.r)
-        slope_std = observation.slope_std
-        n_evaluations += _maximise(space, free, inliers, slope_std, is_map, budget, theta, outcome)
-        budget = learning.max_evaluations - n_evaluations
-    return n_evaluations
+    has_latent = False
+    for i in range(2, len(theta)):
+        has_latent |= space.free[i]
+    inliers = _take_inliers(frame, step, has_latent, alone)
+    if len(inliers.r) < least:
+        return -1
+    outcome[2] = len(inliers.r)
+    return _maximise(space, inliers, slope_std, is_map, max_evaluations, search, theta, outcome)
 
 
-@jit()
+@jit(part=True)
 def _set_first_theta(frame: Frame, growth: GrowthConfig, theta: FloatArray) -> None:
     """See the plain `first_theta`."""
     candidates, lines = frame.candidates, frame.lines
@@ -93,7 +89,7 @@ def _set_first_theta(frame: Frame, growth: GrowthConfig, theta: FloatArray) -> N
             theta[i] = min(max(shown, theta[i] - FARTHEST_START), theta[i] + FARTHEST_START)
 
 
-@jit()
+@jit(part=True)
 def _set_seeds(frame: Frame, growth: GrowthConfig, step: int, alone: SegmentSurfaces) -> None:
     """Set the seeds of every `step`-th segment: without evidence from aside, all that are low."""
     candidates = frame.candidates
@@ -103,68 +99,67 @@ def _set_seeds(frame: Frame, growth: GrowthConfig, step: int, alone: SegmentSurf
             alone.seed[c] = is_low_and_near(candidates.r[c], z, growth)
 
 
-@jit()
+@jit(part=True)
 def _take_inliers(frame: Frame, step: int, has_latent: bool, alone: SegmentSurfaces) -> Inliers:
     """Inliers of every `step`-th segment, and with `has_latent` their pseudo-inputs."""
     candidates, pseudo = frame.candidates, frame.pseudo
-    n_segments = (len(candidates.offsets) + step - 2) // step
-    offsets, bar_offsets = np.zeros(n_segments + 1, np.int64), np.zeros(n_segments + 1, np.int64)
-    places, bars = np.empty(len(candidates.r), np.int64), np.empty(len(pseudo.r_bar), np.int64)
-    n = p = 0
-    for k in range(n_segments):
+    n_segments, most, most_bar = len(candidates.offsets) - 1, len(candidates.r), len(pseudo.r_bar)
+    values, bar_values = np.empty((3, most)), np.empty((2, most_bar))
+    r, z, u, r_bar, log_extent = values[0], values[1], values[2], bar_values[0], bar_values[1]
+    kind = np.empty(most_bar, np.int64)
+    n_used = (n_segments + step - 1) // step
+    offsets, bar_offsets = np.empty(n_used + 1, np.int64), np.empty(n_used + 1, np.int64)
+    n = p = offsets[0] = bar_offsets[0] = 0
+    for k in range(n_used):
         m = k * step
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
-            places[n] = c
-            n += alone.inlier[c]
+            if alone.inlier[c]:
+                r[n], z[n] = candidates.r[c], candidates.z[c] - frame.prior_mean
+                u[n] = alone.log_length_scale[c]
+                n += 1
         if has_latent:
             for c in range(pseudo.offsets[m], pseudo.offsets[m + 1]):
-                bars[p] = c
+                r_bar[p], log_extent[p] = pseudo.r_bar[c], pseudo.log_extent[c]
+                kind[p] = pseudo.kind[c]
                 p += 1
         offsets[k + 1], bar_offsets[k + 1] = n, p
-    places, bars = places[:n], bars[:p]
-    return Inliers(
-        offsets,
-        candidates.r[places],
-        candidates.z[places] - frame.prior_mean,
-        alone.log_length_scale[places],
-        bar_offsets,
-        pseudo.r_bar[bars],
-        pseudo.log_extent[bars],
-        pseudo.kind[bars],
-    )
+    return Inliers(offsets, r[:n], z[:n], u[:n], bar_offsets, r_bar, log_extent, kind)
 
 
-@jit()
+@jit(part=True)
 def _maximise(
     space: ThetaSpace,
-    free: IntArray,
     inliers: Inliers,
     slope_std: float,
     is_map: bool,
     max_evaluations: int,
+    search: Search,
     theta: FloatArray,
     outcome: FloatArray,
 ) -> int:
-    """See the plain `maximise`; `free` are the places of the free entries."""
-    n_data = len(inliers.r)
+    """See the plain `maximise`; an entry that is not free stays where its slope goes on rising."""
+    n_data, slope, any_free = len(inliers.r), np.empty(len(theta)), False
     for i in range(len(theta)):
         theta[i] = min(max(theta[i], space.lower[i]), space.upper[i])
+        any_free |= space.free[i]
+        search.lower[i] = space.lower[i] if space.free[i] else theta[i]
+        search.upper[i] = space.upper[i] if space.free[i] else theta[i]
     outcome[0], outcome[1] = -math.inf, CONVERGED
-    if len(free) == 0 or n_data == 0:
+    if n_data == 0 or not any_free:
         return 0
-    gradient, slope = np.empty(len(theta)), np.empty(len(free))
-    search = search_from(theta[free], space.lower[free], space.upper[free])
+    begin(search, theta)
     n_evaluations, status = 0, BUDGET
     while n_evaluations < max_evaluations:
-        for i in range(len(free)):
-            theta[free[i]] = search.trial[i]
-        value = log_likelihood(theta, inliers, slope_std, not is_map, gradient)
-        for i in range(len(free)):
-            k = free[i]
-            slope[i] = gradient[k]
+        for i in range(len(theta)):
+            theta[i] = search.trial[i]
+        value = log_likelihood(theta, inliers, slope_std, not is_map, slope)
+        for i in range(len(theta)):
+            if not space.free[i]:
+                slope[i] = 1.0
+                continue
             if is_map:
-                value += log_prior(theta[k], space.centre[k], space.prior_std)
-                slope[i] += slope_of_prior(theta[k], space.centre[k], space.prior_std)
+                value += log_prior(theta[i], space.centre[i], space.prior_std)
+                slope[i] += slope_of_prior(theta[i], space.centre[i], space.prior_std)
             slope[i] /= n_data
         n_evaluations += 1
         if n_evaluations == 1 and not math.isfinite(value):
@@ -173,7 +168,7 @@ def _maximise(
         if take_outcome(search, value / n_data, slope) or not propose(search):
             status = CONVERGED
             break
-    for i in range(len(free)):
-        theta[free[i]] = search.x[i]
+    for i in range(len(theta)):
+        theta[i] = search.x[i]
     outcome[0], outcome[1] = search.value[0] * n_data, status
     return n_evaluations

@@ -27,7 +27,7 @@ class _Latent(NamedTuple):
     beta: FloatArray  # (p,)
 
 
-@jit()
+@jit(part=True)
 def log_likelihood(
     theta: FloatArray,
     inliers: Inliers,
@@ -37,11 +37,13 @@ def log_likelihood(
 ) -> float:
     """Return what the twin returns, and set `gradient` (T,)."""
     value, own = 0.0, np.empty(len(theta))
-    gradient[:] = 0.0
+    for i in range(len(theta)):
+        gradient[i] = 0.0
     for m in range(len(inliers.offsets) - 1):
         value += _of_segment(theta, inliers, m, slope_std, latent_terms, own)
         if not math.isfinite(value):
-            gradient[:] = 0.0
+            for i in range(len(theta)):
+                gradient[i] = 0.0
             return -math.inf
         for i in range(len(theta)):
             gradient[i] += own[i]
@@ -60,11 +62,14 @@ def _of_segment(
     """Return the value of segment `m`, -inf where it is not defined; set its gradient."""
     first, bar_first = inliers.offsets[m], inliers.bar_offsets[m]
     n, p = inliers.offsets[m + 1] - first, inliers.bar_offsets[m + 1] - bar_first
-    gradient[:] = 0.0
+    for i in range(len(theta)):
+        gradient[i] = 0.0
     if n == 0:
         return 0.0
     r, z = inliers.r[first : first + n], inliers.z[first : first + n]
-    u = inliers.log_length_scale[first : first + n].copy()
+    u = np.empty(n)
+    for i in range(n):
+        u[i] = inliers.log_length_scale[first + i]
     latent = _Latent(
         inliers.r_bar[bar_first : bar_first + p],
         np.empty((p, p)),

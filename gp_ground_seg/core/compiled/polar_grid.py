@@ -72,8 +72,8 @@ def sort_points(
     cell, r, tile = places.cell, places.r, places.tile
     extremes, numbers = cells.extremes, cells.numbers
     _clear(extremes, numbers, tiles.extremes, tiles.occupied)
-    range_entry = np.empty(BLOCK, dtype=np.int32)
-    key, key_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, dtype=np.int32)
+    range_entry = np.empty(BLOCK, np.int32)
+    key, key_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, np.int32)
     for first in range(0, len(r), BLOCK):
         block = slice(first, min(first + BLOCK, len(r)))
         x, y, z = columns[0, block], columns[1, block], columns[2, block]

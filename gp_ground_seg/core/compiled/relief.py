@@ -145,7 +145,7 @@ def _reachable(
     for c in range(n):
         allowed[c] = r[c] < REACH and not is_face[np.uintp(candidates.tile[c])]
         is_raised[c] = candidates.z[c] + height > RAISED
-    walk = _Walk(np.arange(n), is_raised, np.arange(n), np.zeros(n, np.bool_))
+    walk = _Walk(_trees(n), is_raised, _trees(n), np.zeros(n, np.bool_))
     steep = _step_along(candidates, allowed, walk)
     for aside in range(1, N_ASIDE + 1):
         _step_aside(candidates, allowed, aside, walk)
@@ -178,14 +178,15 @@ def _step(walk: _Walk, a: int, b: int) -> None:
 def _leave_out_not_entered(candidates: Candidates, walk: _Walk, reached: BoolArray) -> None:
     """See the plain `_entered`. A part of raised land is reached as a whole, or not at all."""
     r, n, offsets = candidates.r, len(reached), candidates.offsets
-    width, last = np.zeros(n), np.full(n, -1)
+    width, last = np.zeros(n), np.zeros(n, np.int64)
     for m in range(len(offsets) - 1):
         for c in range(offsets[m], offsets[m + 1]):
             if walk.is_entry[c]:
                 part = _root(walk.part, c)
-                if last[part] != m:
+                # One more than the segment, as 0 is none.
+                if last[part] != m + 1:
                     width[part] += arc_of(r[c], len(offsets) - 1)
-                    last[part] = m
+                    last[part] = m + 1
     for c in range(n):
         reached[c] &= not walk.is_raised[c] or width[_root(walk.part, c)] >= MIN_ENTRY
 
@@ -237,7 +238,7 @@ def _step_up(candidates: Candidates, steep: IntArray, walk: _Walk) -> None:
             segment[k] = m
             k += 1
         starts[m + 1] = k
-    front = np.arange(len(steep))
+    front = _trees(len(steep))
     for aside in range(1, N_ASIDE + 1):
         for k in range(len(steep)):
             beside = (segment[k] + aside) % n_segments
@@ -288,6 +289,15 @@ def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, walk: _W
                     distance = math.sqrt(dr * dr + across * across)
                     if can_step(distance, z[there] - z[c], GENTLE):
                         _step(walk, c, there)
+
+
+@jit()
+def _trees(n: int) -> IntArray:
+    """Trees of one member each."""
+    parent = np.empty(n, np.int64)
+    for c in range(n):
+        parent[c] = c
+    return parent
 
 
 @jit()
@@ -371,7 +381,7 @@ def _sums_around(
             own[first + 7] += w * (x[c] * over)
             own[first + 8] += w * (y[c] * over)
     # What stays arbitrary is that of squares at the border, which nothing needs.
-    rows, around = np.empty_like(own), np.empty_like(own)
+    rows, around = np.empty(len(own)), np.empty(len(own))
     column, row = np.uintp(_WIDTH * _N_SUMS), np.uintp(_N_SUMS)
     for k in range(column, np.uintp(len(own)) - column):
         rows[k] = own[k - column] + own[k] + own[k + column]

@@ -71,8 +71,9 @@ def set_roughness(
 @jit()
 def _known_levels(tiles: Tiles, sums: IntArray, units: float) -> tuple[CellArray, CellArray, int]:
     """Tiles with a return near the surface, the level of each (K,), and the median of these."""
-    counts, n_known = np.zeros(N_LEVELS, np.int32), 0
-    known, level = np.empty((2, len(tiles.occupied)), np.int32)
+    counts, n_known = np.zeros(N_LEVELS, np.int64), 0
+    n = len(tiles.occupied)
+    known, level = np.empty(n, np.int32), np.empty(n, np.int32)
     for tile in tiles.occupied:
         number = sums[np.uintp(tile), 0]
         if number > 0:
@@ -83,7 +84,7 @@ def _known_levels(tiles: Tiles, sums: IntArray, units: float) -> tuple[CellArray
             known[n_known], level[n_known] = tile, found
             counts[found] += 1
             n_known += 1
-    return known[:n_known], level[:n_known], _level_at(counts, 0.5)
+    return known[:n_known], level[:n_known], _level_at(counts, n_known, 0.5)
 
 
 @jit()
@@ -100,8 +101,9 @@ def _levels_about(
     shift, n_rows = window.shift, 1
     # Blocks in a square with one more at each side, so that each has eight around it.
     width = (n_sides - 1 >> shift) + 3
-    block_to_row[: width * width] = 0
-    own, row_to_block = np.empty((2, len(tile) + 1), np.int32)
+    for block in range(width * width):
+        block_to_row[block] = 0
+    own, row_to_block = np.empty(len(tile) + 1, np.int32), np.empty(len(tile) + 1, np.int32)
     for k in range(len(tile)):
         column = tile[k] // n_sides
         row = tile[k] - column * n_sides
@@ -112,12 +114,14 @@ def _levels_about(
         own[k] = block_to_row[block]
     # Row 0 is that of blocks without such a tile. One dimension, as views of rows take longer than
     # the sums.
-    counts[: n_rows * N_WORDS] = 0
+    for w in range(n_rows * N_WORDS):
+        counts[w] = 0
     for k in range(len(tile)):
         counts[np.uintp(own[k] * N_WORDS + level[k] // 8)] += _byte(1, level[k])
     about, level_of_row = np.empty(N_WORDS, np.uint64), np.empty(n_rows, np.int32)
     for n in range(1, n_rows):
-        about[:] = 0
+        for w in range(N_WORDS):
+            about[w] = 0
         about[of_frame // 8] = _byte(window.prior, of_frame)
         for step in range(-width, width + 1, width):
             for beside in range(row_to_block[n] + step - 1, row_to_block[n] + step + 2):
@@ -131,9 +135,9 @@ def _levels_about(
 
 
 @jit()
-def _level_at(counts: CellArray, share: float) -> int:
-    """Level that a `share` of the tiles, counted by level, does not exceed; 0 without any."""
-    most, cumulative, level = share * (counts.sum() - 1), counts[0], 0
+def _level_at(counts: IntArray, n: int, share: float) -> int:
+    """Level that a `share` of `n` tiles, counted by level, does not exceed; 0 without any."""
+    most, cumulative, level = share * (n - 1), counts[0], 0
     while cumulative <= most:
         level += 1
         cumulative += counts[np.uintp(level)]

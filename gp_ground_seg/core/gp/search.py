@@ -36,15 +36,28 @@ class Search(NamedTuple):
     x: FloatArray  # (d,) the best place so far
     gradient: FloatArray  # (d,) there
     trial: FloatArray  # (d,) where the objective is wanted
+    turned: FloatArray  # (d,) working space
     inverse: FloatArray  # (d, d) of the negative curvature
     value: FloatArray  # (2,) at the best place; factor on the next step
 
 
-@shared
 def search_from(x: FloatArray, lower: FloatArray, upper: FloatArray) -> Search:
     """Begin at `x`, within the bounds: the first trial."""
-    value = np.array([-math.inf, 1.0])
-    return Search(lower, upper, x, np.zeros(len(x)), x.copy(), np.eye(len(x)), value)
+    d = len(x)
+    at, gradient, trial, turned = np.empty((4, d))
+    search = Search(lower, upper, at, gradient, trial, turned, np.empty((d, d)), np.empty(2))
+    begin(search, x)
+    return search
+
+
+@shared
+def begin(search: Search, x: FloatArray) -> None:
+    """Begin at `x`, within the bounds: the first trial."""
+    for i in range(len(x)):
+        search.x[i], search.gradient[i], search.trial[i] = x[i], 0.0, x[i]
+        for j in range(len(x)):
+            search.inverse[i, j] = 1.0 if i == j else 0.0
+    search.value[0], search.value[1] = -math.inf, 1.0
 
 
 @shared
@@ -53,7 +66,8 @@ def take_outcome(search: Search, value: float, gradient: FloatArray) -> bool:
 
     A value of ``-inf`` or NaN is worse than any.
     """
-    x, inverse, trial, d = search.x, search.inverse, search.trial, len(search.x)
+    x, inverse, trial, turned = search.x, search.inverse, search.trial, search.turned
+    d, bent = len(x), search.gradient
     gain = value - search.value[0]
     if not gain > 0.0:
         search.value[1] *= SHRINK
@@ -63,18 +77,22 @@ def take_outcome(search: Search, value: float, gradient: FloatArray) -> bool:
                 for j in range(d):
                     inverse[i, j] = SHORTEST if i == j else 0.0
         return False
-    moved, bent, turned = trial - x, search.gradient - gradient, np.zeros(d)
+    for i in range(d):
+        bent[i] -= gradient[i]
     along = across = 0.0
     for i in range(d):
-        along += moved[i] * bent[i]
+        along += (trial[i] - x[i]) * bent[i]
+        turned[i] = 0.0
         for j in range(d):
             turned[i] += inverse[i, j] * bent[j]
         across += bent[i] * turned[i]
     if along > 0.0:
         for i in range(d):
+            moved = trial[i] - x[i]
             for j in range(d):
-                inverse[i, j] += (along + across) / (along * along) * moved[i] * moved[j]
-                inverse[i, j] -= (turned[i] * moved[j] + moved[i] * turned[j]) / along
+                beside = trial[j] - x[j]
+                inverse[i, j] += (along + across) / (along * along) * moved * beside
+                inverse[i, j] -= (turned[i] * beside + moved * turned[j]) / along
     for i in range(d):
         x[i], search.gradient[i] = trial[i], gradient[i]
     search.value[0], search.value[1] = value, 1.0
