@@ -11,7 +11,7 @@ from conftest import REPOSITORY
 from matplotlib.image import imread
 
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.lab.viewers.scene import LEGENDS, palette
+from gp_ground_seg.lab.viewers.page import LEGENDS, palette
 from gp_ground_seg.lab.viewers.tuner import tunable
 
 pytest.importorskip('viser', reason='viser is not installed')

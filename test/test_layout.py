@@ -28,7 +28,7 @@ def lint_imports(folder):
         ('', ''),
         ('core/frame.py', 'import gp_ground_seg.data.files'),
         ('core/pipeline/lines.py', 'from gp_ground_seg.core import segmenter'),
-        ('ros/input.py', 'from gp_ground_seg.lab.plotting import style'),
+        ('ros/input.py', 'from gp_ground_seg.lab.plotting import scan'),
         ('data/ply.py', 'import gp_ground_seg.data.cloud_files'),
         ('cli/demo.py', 'from rclpy.node import Node'),
         ('core/gp/kernels.py', 'from numba import njit'),

@@ -15,7 +15,7 @@ from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.core.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.data import colours as colours_
 from gp_ground_seg.data.colours import COLOURS
-from gp_ground_seg.lab.plotting import scan, style
+from gp_ground_seg.lab.plotting import scan
 from gp_ground_seg.lab.plotting.scan import (
     CAMERA,
     TARGET,
@@ -43,7 +43,7 @@ def repeat(values, n=4000):
 
 def where(path, colour):
     """Centre of the pixels of a colour in the scene, in widths right and up, and their number."""
-    scene = imread(path)[: -round(scan.FOOT * style.DPI)]
+    scene = imread(path)[: -round(scan.FOOT * scan.DPI)]
     rows, columns = np.nonzero(close_to(scene, colour))
     if not len(rows):
         return None, 0

@@ -12,9 +12,8 @@ from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.lab.viewers import html_page
-from gp_ground_seg.lab.viewers.html_page import open_server
-from gp_ground_seg.lab.viewers.scene import palette, point_colours, read_view
+from gp_ground_seg.lab.viewers import page
+from gp_ground_seg.lab.viewers.page import open_server, palette, point_colours, read_view
 from gp_ground_seg.lab.viewers.tuner import Tuner, slider_range, tunable
 
 CAR = 10 | 7 << 16  # class of SemanticKITTI, and an instance of it
@@ -122,7 +121,7 @@ def test_the_tuner_draws_the_labels_of_its_parameters(sequence):
 
 def test_a_server_that_cannot_be_guarded_is_refused():
     pytest.importorskip('viser', reason='viser is not installed')
-    with pytest.raises(DataError, match='install viser'), html_page._guarded('token'):
+    with pytest.raises(DataError, match='install viser'), page._guarded('token'):
         pass  # as a later viser might do: another function serves
 
 

@@ -16,9 +16,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.points import check_points
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.colours import COLOURS
-from gp_ground_seg.lab.plotting import style
-from gp_ground_seg.lab.plotting.scan import Layers, label_layers
-from gp_ground_seg.lab.plotting.style import new_figure, save
+from gp_ground_seg.lab.plotting.scan import GREEN, VIOLET, Layers, label_layers, new_figure, save
 from gp_ground_seg.lab.scoring.metrics import Labels, check_lengths
 
 DPI = 130
@@ -26,9 +24,9 @@ DPI = 130
 WIDTH, WIDTH_OF_SEVERAL, HEIGHT, LEGEND = 9.6, 7.2, 7.6, 2.6
 
 CANDIDATE_COLOUR = '#56636E'
-LINE_COLOUR = style.GREEN
+LINE_COLOUR = GREEN
 SURFACE_COLOUR = '#111111'
-PSEUDO_INPUT_COLOUR = style.VIOLET
+PSEUDO_INPUT_COLOUR = VIOLET
 
 # Metres kept free below and above the ground, and beyond the last candidate; and the distance
 # from the ground up to which a candidate is always in the picture.

@@ -19,8 +19,7 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.inputs import Inputs
 from gp_ground_seg.lab.scoring.metrics import Labels
-from gp_ground_seg.lab.viewers.html_page import box, legend, text
-from gp_ground_seg.lab.viewers.scene import point_colours, read_view
+from gp_ground_seg.lab.viewers.page import box, legend, point_colours, read_view, text
 
 COLOURS = ('changes', 'class', 'height', 'p_ground', 'errors')
 _USUAL = {'sensor.height': (0.2, 4.0), 'sensor.roll': (-0.3, 0.3), 'sensor.pitch': (-0.3, 0.3)}
