@@ -36,7 +36,7 @@ from gp_ground_seg.core.frame import (
     Scan,
     Tiles,
 )
-from gp_ground_seg.core.gp.evidence import CLEARLY, ODDS, STEP, looks_aside_in
+from gp_ground_seg.core.gp.evidence import CLEARLY, ODDS, STEP, uses_neighbours_in
 from gp_ground_seg.core.gp.latent import given_log_length_scales
 from gp_ground_seg.core.gp.learning import BUDGET, Learned, given_theta, theta_space
 from gp_ground_seg.core.gp.search import search_from
@@ -142,19 +142,29 @@ class NumbaBackend:
         is_map, step = learning_.objective == 'map', learning_.segment_step
         odds = ODDS if config.label.rule == 'roughness' else 0.0
         u, knot_u = self._given_length_scales(frame, config)
-        alone, nothing = self._surfaces(u, knot_u), np.empty((2, 0, 0))
+        by_itself, nothing = self._surfaces(u, knot_u), np.empty((2, 0, 0))
         theta, outcome = given_theta(config), np.array([-math.inf, BUDGET, 0.0])
         search = search_from(theta, space.lower.copy(), space.upper.copy())
-        learning.begin_learning(frame, growth, step, alone, theta)
+        learning.begin_learning(frame, growth, step, by_itself, theta)
         n_rounds = n_evaluations = 0
         budget = max(learning_.max_evaluations // 2, 1)
         while budget > 0:
             if config.length_scale.model == 'latent':
                 latent_.latent_log_length_scales(frame, theta, step, u, knot_u)
-            ground.grow_surfaces(frame, theta, observation, growth, odds, nothing, step, alone)
+            ground.grow_surfaces(frame, theta, observation, growth, odds, nothing, step, by_itself)
             least = int(outcome[2]) + 1 if n_rounds >= 2 else 0
             n = learning.learn_round(
-                frame, space, slope_std, is_map, step, least, budget, alone, search, theta, outcome
+                frame,
+                space,
+                slope_std,
+                is_map,
+                step,
+                least,
+                budget,
+                by_itself,
+                search,
+                theta,
+                outcome,
             )
             if n < 0:
                 break
@@ -172,31 +182,45 @@ class NumbaBackend:
         u, knot_u = self._given_length_scales(frame, config)
         if config.length_scale.model == 'latent':
             latent_.latent_log_length_scales(frame, theta, 1, u, knot_u)
-        alone = self._surfaces(u, knot_u)
-        looks_aside = looks_aside_in(frame, config)
-        max_slope = CLEARLY * slope_std if looks_aside else -1.0
-        shown, beside = take('aside', (2, 2, *shape), np.float64)
-        odds = evidence.find_seeds(frame, theta, growth, max_slope, shown[0], alone.seed)
+        by_itself = self._surfaces(u, knot_u)
+        uses_neighbours = uses_neighbours_in(frame, config)
+        max_slope = CLEARLY * slope_std if uses_neighbours else -1.0
+        own_evidence, evidence_table = take('aside', (2, 2, *shape), np.float64)
+        odds = evidence.find_seeds(
+            frame, theta, growth, max_slope, own_evidence[0], by_itself.seed
+        )
         odds = odds if config.label.rule == 'roughness' else 0.0
 
-        def grow(aside: FloatArray, step: int) -> None:
-            ground.grow_surfaces(frame, theta, observation, growth, odds, aside, step, alone)
+        def grow(from_neighbours: FloatArray, step: int) -> None:
+            ground.grow_surfaces(
+                frame, theta, observation, growth, odds, from_neighbours, step, by_itself
+            )
 
         def find_evidence() -> None:
-            evidence.find_evidence(alone.mean, alone.std, theta, knots, slope_std, shown, beside)
+            evidence.find_evidence(
+                by_itself.mean,
+                by_itself.std,
+                theta,
+                knots,
+                slope_std,
+                own_evidence,
+                evidence_table,
+            )
 
-        aside = beside if looks_aside else beside[:, :0]
-        if looks_aside:
-            alone.mean.fill(np.nan)
-            alone.std.fill(np.nan)
-            grow(beside[:, :0], STEP)
+        from_neighbours = evidence_table if uses_neighbours else evidence_table[:, :0]
+        if uses_neighbours:
+            by_itself.mean.fill(np.nan)
+            by_itself.std.fill(np.nan)
+            grow(evidence_table[:, :0], STEP)
             find_evidence()
-        grow(aside, 1)
-        if looks_aside:
+        grow(from_neighbours, 1)
+        if uses_neighbours:
             find_evidence()
         mean, std = np.empty((2, *shape))
-        evidence.combine(alone, aside, theta, knots, slope_std, frame.prior_mean, mean, std)
-        return GroundSurface(knots, mean, std, alone.inlier), knot_u, u
+        evidence.combine(
+            by_itself, from_neighbours, theta, knots, slope_std, frame.prior_mean, mean, std
+        )
+        return GroundSurface(knots, mean, std, by_itself.inlier), knot_u, u
 
     def _given_length_scales(self, frame: Frame, config: Config) -> tuple[FloatArray, FloatArray]:
         """Log length-scales at the candidates and at the knots, to be set if they are latent."""
@@ -243,6 +267,6 @@ class NumbaBackend:
                 take('rows', (n_tiles + 1,), np.int32),
                 *take('voters', (2, n_points), np.int32),
             )
-            labels.settle(scan, lowest_of(surface), has_obstacle, label, votes, result)
+            labels.vote(scan, lowest_of(surface), has_obstacle, label, votes, result)
         keep_code()
         return result

@@ -12,9 +12,9 @@ from gp_ground_seg.core.gp.evidence import (
     ODDS,
     combined_surface,
     is_low_and_near,
+    is_on_object,
     odds_of,
     shown_by,
-    stands_on,
 )
 from gp_ground_seg.core.gp.kernels import prior_variance
 from gp_ground_seg.core.jit import jit
@@ -66,7 +66,7 @@ def find_seeds(
         for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
             if candidates.bin[i] < n_bins:
                 z = candidates.z[i] - frame.prior_mean
-                stands = stands_on(z, table[m, candidates.bin[i]], sigma_n)
+                stands = is_on_object(z, table[m, candidates.bin[i]], sigma_n)
                 seed[i] &= not stands
                 n_standing += stands and not frame.in_face[i]
                 n_near += not frame.in_face[i]
@@ -101,12 +101,14 @@ def find_evidence(
     theta: FloatArray,
     knots: FloatArray,
     slope_std: float,
-    shown: FloatArray,
-    aside: FloatArray,
+    own_evidence: FloatArray,
+    from_neighbours: FloatArray,
 ) -> None:
-    """Do what `evidence_aside` of the twin does, into `aside` (2, M, K): height and precision.
+    """Do what `evidence_of_neighbours` of the twin does.
 
-    `shown` (2, M, K) is overwritten.
+    Into `from_neighbours` (2, M, K): height and precision.
+
+    `own_evidence` (2, M, K) is overwritten.
     """
     n_segments, n_knots = mean.shape
     # Unsigned, as a signed index could count from the end.
@@ -116,17 +118,17 @@ def find_evidence(
         rise[j] = slope_std * 2.0 * math.pi / n_segments * knots[j]
     sill = math.exp(theta[0]) ** 2
     for m in range(n_segments):
-        mean_m, std_m, height, deviation = mean[m], std[m], shown[0, m], shown[1, m]
+        mean_m, std_m, height, deviation = mean[m], std[m], own_evidence[0, m], own_evidence[1, m]
         for j in range(start, end):
             prior = prior_variance(sill, slope_std, knots[j])
             height[j], deviation[j] = shown_by(mean_m[j], std_m[j], prior)
-    aside[:] = 0.0
+    from_neighbours[:] = 0.0
     for side in range(2):
         nearest[:], nearest_std[:] = 0.0, np.inf
         for k in range(2 * n_segments):
             m = k % n_segments if side == 0 else n_segments - 1 - k % n_segments
-            height, deviation = shown[0, m], shown[1, m]
-            weighted, total = aside[0, m], aside[1, m]
+            height, deviation = own_evidence[0, m], own_evidence[1, m]
+            weighted, total = from_neighbours[0, m], from_neighbours[1, m]
             # The first time around finds what the second begins with.
             if k >= n_segments:
                 for j in range(start, end):
@@ -140,15 +142,15 @@ def find_evidence(
                 nearest[j] = height[j] if is_better else nearest[j]
                 nearest_std[j] = deviation[j] if is_better else carried
     for m in range(n_segments):
-        weighted, total = aside[0, m], aside[1, m]
+        weighted, total = from_neighbours[0, m], from_neighbours[1, m]
         for j in range(start, end):
             weighted[j] /= total[j] if total[j] > 0.0 else 1.0
 
 
 @jit(entry=True)
 def combine(
-    alone: SegmentSurfaces,
-    aside: FloatArray,
+    by_itself: SegmentSurfaces,
+    from_neighbours: FloatArray,
     theta: FloatArray,
     knots: FloatArray,
     slope_std: float,
@@ -158,18 +160,20 @@ def combine(
 ) -> None:
     """Set `mean` and `std` to the surface of each segment and the evidence together.
 
-    `aside` (2, M, K) is the evidence, (2, 0, 0) if none is wanted.
+    `from_neighbours` (2, M, K) is the evidence, (2, 0, 0) if none is wanted.
     """
     sill = math.exp(theta[0]) ** 2
     for m in range(len(mean)):
         for j in range(len(knots)):
-            mean[m, j], std[m, j] = alone.mean[m, j], alone.std[m, j]
-            if aside.shape[1] > 0 and not math.isnan(alone.knot_log_length_scale[m, j]):
+            mean[m, j], std[m, j] = by_itself.mean[m, j], by_itself.std[m, j]
+            if from_neighbours.shape[1] > 0 and not math.isnan(
+                by_itself.knot_log_length_scale[m, j]
+            ):
                 mean[m, j], std[m, j] = combined_surface(
                     mean[m, j],
                     std[m, j],
                     prior_variance(sill, slope_std, knots[j]),
-                    aside[0, m, j],
-                    aside[1, m, j],
+                    from_neighbours[0, m, j],
+                    from_neighbours[1, m, j],
                 )
             mean[m, j] += prior_mean

@@ -71,7 +71,7 @@ class _Columns(NamedTuple):
     z, noise : (n,) float64
         Heights of the candidates about the prior mean [m], and variances of the noise with which
         they are observed [m^2].
-    aside_height, aside_precision : (n,) float64
+    neighbour_height, aside_precision : (n,) float64
         Evidence at the candidates.
     above : (n,) bool
         Candidates that the evidence contradicts.
@@ -89,8 +89,8 @@ class _Columns(NamedTuple):
     slope: FloatArray
     z: FloatArray
     noise: FloatArray
-    aside_height: FloatArray
-    aside_precision: FloatArray
+    neighbour_height: FloatArray
+    neighbour_precision: FloatArray
     above: BoolArray
     new: IntArray
     whitened: FloatArray
@@ -103,17 +103,18 @@ def grow_surfaces(
     observation: ObservationConfig,
     growth: GrowthConfig,
     odds: float,
-    aside: FloatArray,
+    from_neighbours: FloatArray,
     step: int,
-    alone: SegmentSurfaces,
+    by_itself: SegmentSurfaces,
 ) -> None:
-    """Inliers and surface of every `step`-th segment, into `alone`.
+    """Inliers and surface of every `step`-th segment, into `by_itself`.
 
-    `aside` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is none.
+    `from_neighbours` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is
+    none.
     Unless `odds` are 0, a candidate among others, or that joins in doubt, shows less: see
     `noise_among` and `noise_in_doubt`.
     """
-    offsets, mean, std = frame.candidates.offsets, alone.mean, alone.std
+    offsets, mean, std = frame.candidates.offsets, by_itself.mean, by_itself.std
     most = 0
     for m in range(0, len(mean), step):
         most = max(most, offsets[m + 1] - offsets[m])
@@ -142,16 +143,20 @@ def grow_surfaces(
     for m in range(0, len(mean), step):
         for j in range(len(frame.knots)):
             mean[m, j] = std[m, j] = np.nan
-        n, n_new, has_aside = _begin(frame, m, noise, reach, aside, alone, columns)
-        if n_new == 0 and not has_aside:
+        n, n_new, has_neighbours = _begin(
+            frame, m, noise, reach, from_neighbours, by_itself, columns
+        )
+        if n_new == 0 and not has_neighbours:
             continue
         n_knots = 0
-        knot_u = alone.knot_log_length_scale[m]
+        knot_u = by_itself.knot_log_length_scale[m]
         while n_knots < len(knot_u) and not math.isnan(knot_u[n_knots]):
             n_knots += 1
         size = (n + n_knots + LANES - 1) & -LANES
-        _lay_out(frame, m, n_knots, size, sill, alone, columns)
-        n_inliers = _grow(frame, m, size, n_new, sill, slope, noise, growth, odds, alone, columns)
+        _lay_out(frame, m, n_knots, size, sill, by_itself, columns)
+        n_inliers = _grow(
+            frame, m, size, n_new, sill, slope, noise, growth, odds, by_itself, columns
+        )
         if n_inliers == 0:
             continue
         for j in range(n_knots):
@@ -174,8 +179,8 @@ def _begin(
     m: int,
     noise: float,
     reach: float,
-    aside: FloatArray,
-    alone: SegmentSurfaces,
+    from_neighbours: FloatArray,
+    by_itself: SegmentSurfaces,
     columns: _Columns,
 ) -> tuple[int, int, bool]:
     """Set heights of the candidates of segment `m`, evidence there, and seeds as the new ones.
@@ -184,7 +189,7 @@ def _begin(
     """
     candidates, knots = frame.candidates, frame.knots
     first, stop = candidates.offsets[m], candidates.offsets[m + 1]
-    n_new, has_aside = 0, False
+    n_new, has_neighbours = 0, False
     near = far = first
     for i in range(stop - first):
         c = first + i
@@ -195,19 +200,19 @@ def _begin(
             far += 1
         columns.z[i], columns.noise[i] = z, noise_among(far - near, noise)
         height = precision = 0.0
-        if aside.shape[1] > 0:
+        if from_neighbours.shape[1] > 0:
             j = candidates.bin[c]
-            heights, precisions = aside[0, m], aside[1, m]
+            heights, precisions = from_neighbours[0, m], from_neighbours[1, m]
             height = between_knots(r, knots[j], knots[j + 1], heights[j], heights[j + 1])
             precision = between_knots(r, knots[j], knots[j + 1], precisions[j], precisions[j + 1])
-        columns.aside_height[i], columns.aside_precision[i] = height, precision
+        columns.neighbour_height[i], columns.neighbour_precision[i] = height, precision
         columns.above[i] = contradicts(height, precision, z, noise)
-        has_aside |= precision > 0.0
-        alone.inlier[c] = False
-        if alone.seed[c] and not columns.above[i]:
+        has_neighbours |= precision > 0.0
+        by_itself.inlier[c] = False
+        if by_itself.seed[c] and not columns.above[i]:
             columns.new[n_new] = i
             n_new += 1
-    return stop - first, n_new, has_aside
+    return stop - first, n_new, has_neighbours
 
 
 @jit(part=True)
@@ -217,7 +222,7 @@ def _lay_out(
     n_knots: int,
     size: int,
     sill: float,
-    alone: SegmentSurfaces,
+    by_itself: SegmentSurfaces,
     columns: _Columns,
 ) -> None:
     """Set ranges and length-scales of candidates and knots, and their prior."""
@@ -227,9 +232,9 @@ def _lay_out(
     # Element by element: assigned slices take as long, and seconds to compile.
     for i in range(n):
         r[i] = frame.candidates.r[first + i]
-        length_scale[i] = alone.log_length_scale[first + i]
+        length_scale[i] = by_itself.log_length_scale[first + i]
     for j in range(n_knots):
-        r[n + j], length_scale[n + j] = frame.knots[j], alone.knot_log_length_scale[m, j]
+        r[n + j], length_scale[n + j] = frame.knots[j], by_itself.knot_log_length_scale[m, j]
     for j in range(n + n_knots, size):
         r[j] = length_scale[j] = 0.0
     for j in range(size):
@@ -249,19 +254,21 @@ def _grow(
     noise: float,
     growth: GrowthConfig,
     odds: float,
-    alone: SegmentSurfaces,
+    by_itself: SegmentSurfaces,
     columns: _Columns,
 ) -> int:
     """Let the new ones join, and those that then fit, until none does; return the number."""
     first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
-    inlier, in_face = alone.inlier[first:stop], frame.in_face[first:stop]
+    inlier, in_face = by_itself.inlier[first:stop], frame.in_face[first:stop]
     continues_line = frame.continues_line[first:stop]
     n_inliers = done = 0
     for a in range(n_new):
         i = columns.new[a]
         if odds > 0.0 and in_face[i]:
             height, variance = combined(
-                *_predict(i, slope, columns), columns.aside_height[i], columns.aside_precision[i]
+                *_predict(i, slope, columns),
+                columns.neighbour_height[i],
+                columns.neighbour_precision[i],
             )
             columns.noise[i] = noise_in_doubt(
                 columns.z[i], height, variance, columns.noise[i], True, odds
@@ -277,14 +284,14 @@ def _grow(
             n_inliers += 1
         n_new = 0
         for i in range(done, len(inlier)):
-            precision = columns.aside_precision[i]
+            precision = columns.neighbour_precision[i]
             # Before anything has joined, only evidence from aside decides.
             if inlier[i] or (n_inliers == 0 and precision == 0.0):
                 continue
             follows = i > 0 and inlier[i - 1] and continues_line[i] and not columns.above[i]
             if not follows:
                 height, variance = combined(
-                    *_predict(i, slope, columns), columns.aside_height[i], precision
+                    *_predict(i, slope, columns), columns.neighbour_height[i], precision
                 )
                 follows = fits(columns.z[i], height, variance, noise, growth)
                 if follows and odds > 0.0:

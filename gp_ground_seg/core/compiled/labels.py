@@ -2,7 +2,7 @@
 
 `fit_pieces` prepares the surface of each cell, `survey` measures the heights of the points over
 it, `label_by_bands` labels the points by the roughness of the ground (see
-`gp_ground_seg.core.compiled.roughness`), and `settle` changes labels near obstacles by votes.
+`gp_ground_seg.core.compiled.roughness`), and `vote` changes labels near obstacles by votes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from gp_ground_seg.core.pipeline.labels import (
     ground_band,
     is_near,
     layer_of,
-    settled_margin,
+    margin_after_vote,
     vote_of,
     whole_units,
 )
@@ -183,7 +183,7 @@ def label_by_bands(
 
 
 @jit(entry=True)
-def settle(
+def vote(
     scan: Scan,
     lowest: float,
     has_obstacle: BoolArray,
@@ -207,7 +207,7 @@ def settle(
             total += sums[np.uintp(place - layer + (layer + step) % N_LAYERS)]
         number = total // VOTER_FLAG
         mean = (total - number * VOTER_FLAG) / number - VOTE_UNITS
-        margins[i] = settled_margin(margins[i], mean * unit)
+        margins[i] = margin_after_vote(margins[i], mean * unit)
         result.label[i] = _GROUND if margins[i] >= 0.0 else _OBSTACLE
 
 

@@ -30,11 +30,11 @@ from gp_ground_seg.core.parameters.config import GrowthConfig
 
 @jit(entry=True)
 def begin_learning(
-    frame: Frame, growth: GrowthConfig, step: int, alone: SegmentSurfaces, theta: FloatArray
+    frame: Frame, growth: GrowthConfig, step: int, by_itself: SegmentSurfaces, theta: FloatArray
 ) -> None:
     """Set the first theta (T,), which holds the given values, and the seeds."""
     _set_first_theta(frame, growth, theta)
-    _set_seeds(frame, growth, step, alone)
+    _set_seeds(frame, growth, step, by_itself)
 
 
 @jit(entry=True)
@@ -46,7 +46,7 @@ def learn_round(
     step: int,
     least: int,
     max_evaluations: int,
-    alone: SegmentSurfaces,
+    by_itself: SegmentSurfaces,
     search: Search,
     theta: FloatArray,
     outcome: FloatArray,
@@ -59,7 +59,7 @@ def learn_round(
     has_latent = False
     for i in range(2, len(theta)):
         has_latent |= space.free[i]
-    inliers = _take_inliers(frame, step, has_latent, alone)
+    inliers = _take_inliers(frame, step, has_latent, by_itself)
     if len(inliers.r) < least:
         return -1
     outcome[2] = len(inliers.r)
@@ -90,17 +90,19 @@ def _set_first_theta(frame: Frame, growth: GrowthConfig, theta: FloatArray) -> N
 
 
 @jit(part=True)
-def _set_seeds(frame: Frame, growth: GrowthConfig, step: int, alone: SegmentSurfaces) -> None:
+def _set_seeds(frame: Frame, growth: GrowthConfig, step: int, by_itself: SegmentSurfaces) -> None:
     """Set the seeds of every `step`-th segment: without evidence from aside, all that are low."""
     candidates = frame.candidates
     for m in range(0, len(candidates.offsets) - 1, step):
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
             z = candidates.z[c] - frame.prior_mean
-            alone.seed[c] = is_low_and_near(candidates.r[c], z, growth)
+            by_itself.seed[c] = is_low_and_near(candidates.r[c], z, growth)
 
 
 @jit(part=True)
-def _take_inliers(frame: Frame, step: int, has_latent: bool, alone: SegmentSurfaces) -> Inliers:
+def _take_inliers(
+    frame: Frame, step: int, has_latent: bool, by_itself: SegmentSurfaces
+) -> Inliers:
     """Inliers of every `step`-th segment, and with `has_latent` their pseudo-inputs."""
     candidates, pseudo = frame.candidates, frame.pseudo
     n_segments, most, most_bar = len(candidates.offsets) - 1, len(candidates.r), len(pseudo.r_bar)
@@ -113,9 +115,9 @@ def _take_inliers(frame: Frame, step: int, has_latent: bool, alone: SegmentSurfa
     for k in range(n_used):
         m = k * step
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
-            if alone.inlier[c]:
+            if by_itself.inlier[c]:
                 r[n], z[n] = candidates.r[c], candidates.z[c] - frame.prior_mean
-                u[n] = alone.log_length_scale[c]
+                u[n] = by_itself.log_length_scale[c]
                 n += 1
         if has_latent:
             for c in range(pseudo.offsets[m], pseudo.offsets[m + 1]):

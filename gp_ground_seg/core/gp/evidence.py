@@ -61,17 +61,17 @@ def contradicts(height: Values, precision: Values, z: Values, noise: Values) -> 
 
 @shared
 def combined(
-    height: Values, variance: Values, aside_height: Values, aside_precision: Values
+    height: Values, variance: Values, neighbour_height: Values, neighbour_precision: Values
 ) -> tuple[Values, Values]:
     """Height and variance of an estimate together with the evidence from aside."""
     variance = np.maximum(variance, 0.0)
-    share = 1.0 / (1.0 + variance * aside_precision)
-    return share * height + (1.0 - share) * aside_height, share * variance
+    share = 1.0 / (1.0 + variance * neighbour_precision)
+    return share * height + (1.0 - share) * neighbour_height, share * variance
 
 
 @shared
 def combined_surface(
-    mean: Values, std: Values, prior: Values, aside_height: Values, aside_precision: Values
+    mean: Values, std: Values, prior: Values, neighbour_height: Values, neighbour_precision: Values
 ) -> tuple[Values, Values]:
     """Height and standard deviation of a surface together with the evidence from aside [m].
 
@@ -82,10 +82,10 @@ def combined_surface(
     height, variance = combined(
         choose(has_surface, mean, 0.0),
         choose(has_surface, least * least, prior),
-        aside_height,
-        aside_precision,
+        neighbour_height,
+        neighbour_precision,
     )
-    is_known = has_surface | (aside_precision > 0.0)
+    is_known = has_surface | (neighbour_precision > 0.0)
     return choose(is_known, height, np.nan), choose(is_known, np.sqrt(variance), np.nan)
 
 
@@ -121,7 +121,7 @@ def is_low_and_near(r: Values, z: Values, growth: GrowthConfig) -> Values:
 
 
 @shared
-def stands_on(z: Values, highest: Values, sigma_n: Values) -> Values:
+def is_on_object(z: Values, highest: Values, sigma_n: Values) -> Values:
     """Whether a candidate is higher than the `highest` ground and the noise of two explain."""
     return z > highest + CLEARLY * math.sqrt(2.0) * sigma_n
 
@@ -137,8 +137,8 @@ def odds_of(n_standing: Values, n_candidates: Values) -> Values:
     return np.maximum(seen, ODDS)
 
 
-def looks_aside_in(frame: Frame, config: Config) -> bool:
-    """Whether segments look aside: without a prior slope others would be right at any distance."""
+def uses_neighbours_in(frame: Frame, config: Config) -> bool:
+    """Whether segments use their neighbours: without a prior slope a distance tells nothing."""
     wanted = config.surface.look_aside and config.observation.slope_std > 0.0
     return wanted and len(frame.knots) > 0
 
@@ -153,11 +153,11 @@ def seeds(frame: Frame, theta: FloatArray, config: Config) -> tuple[BoolArray, f
     candidates, growth = frame.candidates, config.growth
     z = candidates.z - frame.prior_mean
     seed: BoolArray = is_low_and_near(candidates.r, z, growth)
-    if not looks_aside_in(frame, config):
+    if not uses_neighbours_in(frame, config):
         return seed, ODDS
     max_slope = CLEARLY * config.observation.slope_std
     highest = highest_ground(frame, z, seed, max_slope)
-    stands = stands_on(z, highest, np.exp(theta[1]))
+    stands = is_on_object(z, highest, np.exp(theta[1]))
     counts = np.isfinite(highest) & ~frame.in_face
     n_standing, n_candidates = np.count_nonzero(stands & counts), np.count_nonzero(counts)
     return seed & ~stands, float(odds_of(n_standing, n_candidates))
@@ -216,7 +216,7 @@ def _reaches(n_segments: int) -> Iterator[int]:
         reach *= 2
 
 
-def evidence_aside(
+def evidence_of_neighbours(
     mean: FloatArray, std: FloatArray, prior: FloatArray, knots: FloatArray, slope_std: float
 ) -> Evidence:
     """Evidence at the knots of every segment from the surfaces of the others, (M, K).
@@ -263,12 +263,14 @@ def _of_nearest(
     return height, deviation
 
 
-def at_candidates(aside: Evidence, candidates: Candidates, knots: FloatArray) -> Evidence:
+def at_candidates(
+    from_neighbours: Evidence, candidates: Candidates, knots: FloatArray
+) -> Evidence:
     """Evidence at the candidates, (C,): linear between the knots about each."""
     r, segment, near = candidates.r, candidates.segment, candidates.bin
     far = near + 1
     height, precision = (
         between_knots(r, knots[near], knots[far], table[segment, near], table[segment, far])
-        for table in aside
+        for table in from_neighbours
     )
     return Evidence(height, precision)

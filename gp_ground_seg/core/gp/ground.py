@@ -22,9 +22,9 @@ from gp_ground_seg.core.gp.evidence import (
     combined,
     combined_surface,
     contradicts,
-    evidence_aside,
-    looks_aside_in,
+    evidence_of_neighbours,
     seeds,
+    uses_neighbours_in,
 )
 from gp_ground_seg.core.gp.kernels import paciorek, prior_variance
 from gp_ground_seg.core.gp.latent import given_log_length_scales, latent_log_length_scales
@@ -87,7 +87,7 @@ def estimate_surface(
     largest = prior_variance(sill, slope_std, candidates.r.max(initial=0.0))
     gate_noise = max(gate_noise, ROUNDING * largest)
     noise = np.full(len(z), gate_noise)
-    alone = SegmentSurfaces.empty(len(z), knot_u.shape)
+    by_itself = SegmentSurfaces.empty(len(z), knot_u.shape)
     seed, odds = seeds(frame, theta, config)
     if config.label.rule == 'roughness':
         n_near = _count_near(candidates, np.exp(theta[3]))
@@ -96,21 +96,27 @@ def estimate_surface(
         odds = 0.0
     model = _Model(frame, sill, gate_noise, z, noise, np.exp(u), np.exp(knot_u), seed, odds)
     everywhere = np.arange(candidates.n_segments)
-    looks_aside, none = looks_aside_in(frame, config), np.zeros((2, len(z)))
+    uses_neighbours, none = uses_neighbours_in(frame, config), np.zeros((2, len(z)))
     prior = prior_variance(sill, slope_std, knots)
 
-    def aside() -> Evidence:
-        return evidence_aside(alone.mean, alone.std, prior, knots, slope_std)
+    def evidence() -> Evidence:
+        return evidence_of_neighbours(by_itself.mean, by_itself.std, prior, knots, slope_std)
 
-    if looks_aside:
-        _grow_segments(everywhere[::STEP], model, Evidence(*none), config, alone)
-        beside = at_candidates(aside(), candidates, knots)
-    _grow_segments(everywhere, model, beside if looks_aside else Evidence(*none), config, alone)
-    mean, std = alone.mean, alone.std
-    if looks_aside:
-        mean, std = combined_surface(mean, std, prior, *aside())
+    if uses_neighbours:
+        _grow_segments(everywhere[::STEP], model, Evidence(*none), config, by_itself)
+        from_neighbours = at_candidates(evidence(), candidates, knots)
+    _grow_segments(
+        everywhere,
+        model,
+        from_neighbours if uses_neighbours else Evidence(*none),
+        config,
+        by_itself,
+    )
+    mean, std = by_itself.mean, by_itself.std
+    if uses_neighbours:
+        mean, std = combined_surface(mean, std, prior, *evidence())
         mean[np.isnan(knot_u)] = std[np.isnan(knot_u)] = np.nan
-    return GroundSurface(knots, mean + frame.prior_mean, std, alone.inlier), knot_u, u
+    return GroundSurface(knots, mean + frame.prior_mean, std, by_itself.inlier), knot_u, u
 
 
 OBSTACLE_DEPTH = 1.0
@@ -219,23 +225,31 @@ def noise_in_doubt(
 
 
 def _grow_segments(
-    segments: IntArray, model: _Model, aside: Evidence, config: Config, alone: SegmentSurfaces
+    segments: IntArray,
+    model: _Model,
+    from_neighbours: Evidence,
+    config: Config,
+    by_itself: SegmentSurfaces,
 ) -> None:
-    """Inliers and surface of `segments`, into `alone`; `aside` is the evidence at candidates."""
-    alone.mean[segments] = alone.std[segments] = np.nan
+    """Inliers and surface of `segments`, into `by_itself`, with the evidence at candidates."""
+    by_itself.mean[segments] = by_itself.std[segments] = np.nan
     offsets = model.frame.candidates.offsets
-    is_below = ~contradicts(*aside, model.z, model.gate_noise)
+    is_below = ~contradicts(*from_neighbours, model.z, model.gate_noise)
     continues_line = model.frame.continues_line & is_below
     model = model._replace(
         frame=model.frame._replace(continues_line=continues_line), seed=model.seed & is_below
     )
     size = offsets[segments + 1] - offsets[segments]
     for batch in batches(np.concatenate([[0], np.cumsum(size)])):
-        _grow_batch(segments[batch], model, aside, config, alone)
+        _grow_batch(segments[batch], model, from_neighbours, config, by_itself)
 
 
 def _grow_batch(
-    segments: IntArray, model: _Model, aside: Evidence, config: Config, alone: SegmentSurfaces
+    segments: IntArray,
+    model: _Model,
+    from_neighbours: Evidence,
+    config: Config,
+    by_itself: SegmentSurfaces,
 ) -> None:
     frame, slope_std = model.frame, config.observation.slope_std
     layout = Padded.of(segments, frame.candidates.offsets)
@@ -257,15 +271,15 @@ def _grow_batch(
         model.seed[layout.place] & layout.mask,
         frame.continues_line[layout.place] & layout.mask,
         frame.in_face[layout.place],
-        Evidence(layout.take(aside.height), layout.take(aside.precision)),
+        Evidence(layout.take(from_neighbours.height), layout.take(from_neighbours.precision)),
     )
     chosen, height, variance = _grow(batch, config.growth, model.odds)
-    alone.inlier[layout.place[layout.mask]] = chosen[layout.mask]
+    by_itself.inlier[layout.place[layout.mask]] = chosen[layout.mask]
     is_known = is_wanted & chosen.any(axis=1, keepdims=True)
     n = chosen.shape[1]
     std = np.sqrt(np.maximum(variance[:, n:], 0.0))
-    alone.mean[segments, :n_knots] = np.where(is_known, height[:, n:], np.nan)
-    alone.std[segments, :n_knots] = np.where(is_known, std, np.nan)
+    by_itself.mean[segments, :n_knots] = np.where(is_known, height[:, n:], np.nan)
+    by_itself.std[segments, :n_knots] = np.where(is_known, std, np.nan)
 
 
 class _Batch(NamedTuple):
@@ -283,7 +297,7 @@ class _Batch(NamedTuple):
     seed: BoolArray  # (S, n)
     continues_line: BoolArray  # (S, n)
     in_face: BoolArray  # (S, n)
-    aside: Evidence  # (S, n)
+    from_neighbours: Evidence  # (S, n)
 
 
 @np.errstate(over='ignore')  # the square of 1e200 m: no fit
@@ -303,7 +317,7 @@ def _grow(
     active, joining = np.arange(n_segments), batch.seed
     whitened = np.empty((n_segments, 0, variance.shape[1]))
     if odds > 0.0:
-        predicted = combined(0.0, variance[:, :n], *batch.aside)
+        predicted = combined(0.0, variance[:, :n], *batch.from_neighbours)
         doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, True, odds)
         batch.noise[:] = np.where(joining & batch.in_face, doubtful, batch.noise)
     while len(active):
@@ -312,11 +326,11 @@ def _grow(
             whitened = _condition(batch, active, joining[active], whitened, height, variance)
         following = np.zeros_like(chosen)
         following[:, 1:] = batch.continues_line[:, 1:] & chosen[:, :-1]
-        predicted = combined(height[:, :n], variance[:, :n], *batch.aside)
+        predicted = combined(height[:, :n], variance[:, :n], *batch.from_neighbours)
         joining = fits(batch.z, *predicted, batch.gate_noise, growth) | following
         joining &= ~chosen & batch.mask
         # Before anything has joined, only evidence from aside decides.
-        joining &= chosen.any(axis=1, keepdims=True) | (batch.aside.precision > 0.0)
+        joining &= chosen.any(axis=1, keepdims=True) | (batch.from_neighbours.precision > 0.0)
         if odds > 0.0:
             doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, batch.in_face, odds)
             batch.noise[:] = np.where(joining & ~following, doubtful, batch.noise)

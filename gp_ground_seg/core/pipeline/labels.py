@@ -82,7 +82,7 @@ def label_points(
         voters = np.flatnonzero(is_near(height))
         heights = z[voters] - lowest_of(surface)
         voters, means = mean_votes(voters, heights, margin, tiles, label.ground_tolerance)
-        margin[voters] = settled_margin(margin[voters], means)
+        margin[voters] = margin_after_vote(margin[voters], means)
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
     return Labelled(result, height, margin)
@@ -153,8 +153,12 @@ def vote_of(margin: Values, tolerance: float) -> Values:
 
 
 @shared
-def settled_margin(margin: Values, mean: Values) -> Values:
-    """Margin of a return by the mean vote about it [m]: the larger where both agree, else that."""
+def margin_after_vote(margin: Values, mean: Values) -> Values:
+    """Margin of a return after the vote [m].
+
+    The mean about it decides between ground and obstacle; its own margin counts where it is
+    larger on that side.
+    """
     lower, upper = choose(margin < mean, margin, mean), choose(margin < mean, mean, margin)
     return choose(mean >= 0.0, upper, lower)
 
