@@ -34,26 +34,34 @@ def tuple_type(group: type[Any]) -> type[Any]:
     return namedtuple(group.__name__, names, module=__name__)
 
 
-_TUPLE_TYPES: dict[type[Any], Any] = {
-    group: tuple_type(group)
-    for group in (
-        config.LinesConfig,
-        config.LengthScaleConfig,
-        config.ObservationConfig,
-        config.LatentConfig,
-        config.GrowthConfig,
-        config.LearningConfig,
-        config.FacesConfig,
-        config.LabelConfig,
+# numba pickles a type with the code it keeps, by module and name: each needs its own.
+LinesConfig = tuple_type(config.LinesConfig)
+LengthScaleConfig = tuple_type(config.LengthScaleConfig)
+ObservationConfig = tuple_type(config.ObservationConfig)
+LatentConfig = tuple_type(config.LatentConfig)
+GrowthConfig = tuple_type(config.GrowthConfig)
+LearningConfig = tuple_type(config.LearningConfig)
+FacesConfig = tuple_type(config.FacesConfig)
+LabelConfig = tuple_type(config.LabelConfig)
+
+_TUPLE_TYPES: dict[str, Any] = {
+    kind.__name__: kind
+    for kind in (
+        LinesConfig,
+        LengthScaleConfig,
+        ObservationConfig,
+        LatentConfig,
+        GrowthConfig,
+        LearningConfig,
+        FacesConfig,
+        LabelConfig,
     )
 }
-# numba pickles the types with the code it keeps, by module and name.
-globals().update({kind.__name__: kind for kind in _TUPLE_TYPES.values()})
 
 
 @lru_cache(maxsize=64)
 def numbers_of(group: _Group) -> _Group:
     """Return the numbers of a group under the same names."""
-    kind = _TUPLE_TYPES[type(group)]
+    kind = _TUPLE_TYPES[type(group).__name__]
     values = [getattr(group, name) for name in kind._fields]
     return cast(_Group, kind(*values))
