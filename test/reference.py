@@ -151,7 +151,7 @@ def _is_critical(start, new, r, z, density, lines):
 
 def pseudo_inputs(candidates, lines, config):
     """One pseudo-input in the middle of each of equal shares of a line's candidates."""
-    r_bar, guesses, places, kinds = [], [], [], []
+    r_bar, guesses, places, lines_of, kinds = [], [], [], [], []
     limits, per = config.length_scale, config.latent.candidates_per_pseudo_input
     for q in range(len(lines.slope)):
         first, stop = lines.start[q], lines.start[q + 1]
@@ -162,6 +162,7 @@ def pseudo_inputs(candidates, lines, config):
             r_bar.append(candidates.r[place])
             guesses.append(math.log(min(max(extent, limits.min), limits.max)))
             places.append(place)
+            lines_of.append(q)
             kinds.append(line_class(lines.slope[q], guesses[-1], limits))
     offsets = np.array([sum(p < o for p in places) for o in candidates.offsets], np.int64)
     if config.learning.length_scale == 'factor':
@@ -169,8 +170,8 @@ def pseudo_inputs(candidates, lines, config):
     else:
         edges = np.linspace(math.log(limits.min), math.log(limits.max), 7)
         guesses = [edges[2 * (kind // 3) + 1] for kind in kinds]
-    kinds = np.array(kinds, np.int64)
-    return PseudoInputs(np.array(r_bar, float), np.array(guesses, float), offsets, kinds)
+    lines_of, kinds = np.array(lines_of, np.int64), np.array(kinds, np.int64)
+    return PseudoInputs(np.array(r_bar, float), np.array(guesses, float), offsets, lines_of, kinds)
 
 
 def line_class(slope, log_extent, limits):

@@ -218,6 +218,7 @@ class PseudoInputs(NamedTuple):
     r_bar: FloatArray  # (P,) ranges [m], increasing in each segment
     log_extent: FloatArray  # (P,) log extent of the line of each, first guess of L-bar [log m]
     offsets: IntArray  # (M + 1,) pseudo-inputs of segment m are ``offsets[m]:offsets[m + 1]``
+    line: IntArray  # (P,) number of the line that each is on
     # (P,) class of the line of each; those of a class share an entry of L-bar, ``theta[5 + kind]``
     kind: IntArray
 

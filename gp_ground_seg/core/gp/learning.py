@@ -228,6 +228,7 @@ def every_segment(frame: Frame, step: int) -> Frame:
             pseudo.r_bar[kept_bar],
             pseudo.log_extent[kept_bar],
             bar_offsets,
+            pseudo.line[kept_bar],
             pseudo.kind[kept_bar],
         ),
         continues_line=frame.continues_line[kept],

@@ -16,7 +16,6 @@ from gp_ground_seg.core.frame import (
     Candidates,
     Faces,
     FloatArray,
-    IntArray,
     Lines,
     PseudoInputs,
 )
@@ -58,7 +57,8 @@ def lines_through(
     n = len(candidates.r)
     lines = Lines(np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64))
     offsets = np.empty(len(candidates.offsets), np.int64)
-    pseudo = PseudoInputs(np.empty(n), np.empty(n), offsets, np.empty(n, np.int64))
+    line, kind = np.empty((2, n), np.int64)
+    pseudo = PseudoInputs(np.empty(n), np.empty(n), offsets, line, kind)
     continues_line = np.empty(n, np.bool_)
     groups = tuple(
         map(numbers_of, (config.lines, config.growth, config.latent, config.length_scale))
@@ -66,11 +66,10 @@ def lines_through(
     is_break = find_breaks(candidates.r, candidates.density, config.lines)
     n_lines, n_pseudo = trace_lines(candidates, is_break, groups, lines, pseudo, continues_line)
     lines = Lines(lines.line, lines.slope[:n_lines], lines.start[: n_lines + 1])
-    r_bar, log_extent, offsets, line = pseudo
-    line = line[:n_pseudo]
-    pseudo = PseudoInputs(r_bar[:n_pseudo], log_extent[:n_pseudo], offsets, np.zeros_like(line))
+    n = n_pseudo
+    pseudo = PseudoInputs(pseudo.r_bar[:n], pseudo.log_extent[:n], offsets, line[:n], kind[:n])
     if config.learning.length_scale == 'classes':
-        pseudo = shared_by_class(line, lines, pseudo, config.length_scale)
+        pseudo = shared_by_class(lines, pseudo, config.length_scale)
     return lines, pseudo, continues_line
 
 
@@ -81,7 +80,7 @@ def _trace_lists(
     lines, pseudo, continues_line = results
     *inputs, breaks = (column.tolist() for column in (*candidates, is_break))
     views: Any = [memoryview(array) for array in (*lines, *pseudo, continues_line)]
-    results = Lines(*views[:3]), PseudoInputs(*views[3:7]), views[7]
+    results = Lines(*views[:3]), PseudoInputs(*views[3:8]), views[8]
     return trace(Candidates(*inputs), breaks, groups, *results)
 
 
@@ -95,16 +94,14 @@ def class_middles(limits: LengthScaleConfig) -> FloatArray:
     return np.repeat(edges[1::2], N_CLASSES // 3).astype(np.float64)
 
 
-def shared_by_class(
-    line: IntArray, lines: Lines, pseudo: PseudoInputs, limits: LengthScaleConfig
-) -> PseudoInputs:
+def shared_by_class(lines: Lines, pseudo: PseudoInputs, limits: LengthScaleConfig) -> PseudoInputs:
     """Pseudo-inputs of which those on lines of one class share the first guess.
 
     "All segments share L-bar" (paper, section III-E), though each has other lines. The classes
     are those of `class_middles`, and by slope: the line falls, is flat up to
-    ``length_scale.flat_gradient``, or rises. `line` (P,) is that of each pseudo-input.
+    ``length_scale.flat_gradient``, or rises.
     """
-    slope, share = lines.slope[line], pseudo.log_extent - math.log(limits.min)
+    slope, share = lines.slope[pseudo.line], pseudo.log_extent - math.log(limits.min)
     by_length = (3.0 * share / math.log(limits.max / limits.min)).astype(np.int64)
     # A line of one point has no slope: it is flat.
     by_slope = (
@@ -271,7 +268,7 @@ def select_pseudo_inputs(
             # The middle of each of `number` equal shares of the line's candidates.
             pseudo.r_bar[p] = r[first + (size * (2 * rank + 1)) // (2 * number)]
             pseudo.log_extent[p] = log_extent
-            pseudo.kind[p] = q  # the line, until `lines_through` puts its class there
+            pseudo.line[p], pseudo.kind[p] = q, 0
             p += 1
     for k in range(m, len(pseudo.offsets)):
         pseudo.offsets[k] = p
