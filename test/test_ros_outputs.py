@@ -154,6 +154,20 @@ def test_occupancy_is_what_a_costmap_takes(b, reduced):
         assert np.isin(at, (value, 100)).all() and (at == value).mean() > 0.9
 
 
+def test_the_time_of_a_scan_is_that_between_clouds(b):
+    collector = ros.Collector(b.probe, LaserScan, f'{NODE_NAME}/scan')
+    publisher = next(p for o, p in b.node._outputs._publishers if o.topic == '~/scan')
+    wait_for(lambda: publisher.get_subscription_count() == 1, 'ear of ~/scan')
+    for n, (sec, nanosec) in enumerate([(100, 0), (100, 10**8), (105, 0)], 1):
+        message = to_message(street(500))
+        message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
+        b.segment(message)
+        collector.wait(n)
+    b.in_executor(b.probe.destroy_subscription, collector.subscription)
+    # After a pause it says nothing.
+    assert [scan.scan_time for scan in collector.messages[1:]] == pytest.approx([0.1, 0.0])
+
+
 def test_scan_and_occupancy_end_at_the_edge_of_a_drop(b):
     """Ground that goes on 0.6 m lower from x = 6 m on; without the parameter nothing is there."""
     rings, azimuth = np.meshgrid(np.geomspace(3.5, 30.0, 60), np.linspace(-np.pi, np.pi, 1440))

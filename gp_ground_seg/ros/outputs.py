@@ -37,6 +37,8 @@ from gp_ground_seg.ros.input import cloud_profile
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
+LONGEST_PERIOD = 1.0
+"""Time between two clouds from which it says nothing of the sensor [s]: clouds are missing."""
 
 
 class Output(NamedTuple):
@@ -155,6 +157,8 @@ OUTPUTS = (
 class OutputPublishers:
     """Publishers of all outputs of `node`."""
 
+    _stamp = math.inf  # of the last cloud [s]
+
     def __init__(self, node: Node) -> None:
         self._logger = node.get_logger()
         self._renamed: dict[str, str] = {}
@@ -170,6 +174,9 @@ class OutputPublishers:
 
     def publish(self, segmented: SegmentedCloud) -> list[str]:
         """Publish all outputs of a cloud, or none if one cannot be built; return their topics."""
+        stamp = segmented.cloud.header.stamp
+        seconds = stamp.sec + 1e-9 * stamp.nanosec
+        period, self._stamp = seconds - self._stamp, seconds
         messages = [
             (output, publisher, output.build(segmented))
             for output, publisher in self._publishers
@@ -178,6 +185,8 @@ class OutputPublishers:
         for output, publisher, message in messages:
             if output is LABELLED:
                 self._warn_of_renamed(segmented.cloud)
+            if isinstance(message, LaserScan):
+                message.scan_time = period if 0.0 < period < LONGEST_PERIOD else 0.0
             publisher.publish(message)
         return [publisher.topic_name for _, publisher, _ in messages]
 
