@@ -10,7 +10,7 @@ import os
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from numbers import Real
 from pathlib import Path
 from typing import Any, NoReturn
@@ -28,12 +28,23 @@ from gp_ground_seg.core.pipeline.low_sensor import for_sensor
 from gp_ground_seg.core.pipeline.mirror_images import MirrorImages, find_mirror_images
 from gp_ground_seg.core.pipeline.points import take_points
 from gp_ground_seg.core.pipeline.sensor_pose import (
+    CLEAR_TILT,
     SensorPose,
     estimate_pose,
     given_pose,
+    origin_of,
     with_fallback,
 )
-from gp_ground_seg.core.pipeline.tilt import rotate_sample
+from gp_ground_seg.core.pipeline.tilt import ENOUGH_POINTS, Direction, rotate
+from gp_ground_seg.core.pipeline.up_axis import (
+    MAX_TILT,
+    OTHER_AXES,
+    UPRIGHT,
+    View,
+    clearest,
+    is_doubtful,
+    view_of,
+)
 from gp_ground_seg.core.result import Segmentation
 
 _LOGGER = logging.getLogger('gp_ground_seg')
@@ -76,7 +87,6 @@ class GroundSegmenter:
         self._clock = clock
         self._config = config_of(config, **parameters)
         self._backend = make_backend(self._config.runtime) if backend is None else backend
-        self._sample_backend: Backend | None = None
         self._warned: set[str] = set()
         self._lock, self._pid = threading.RLock(), os.getpid()
 
@@ -192,7 +202,7 @@ class GroundSegmenter:
     def use_backend(self, backend: Backend) -> None:
         """Use `backend` from the next scan on."""
         with self._exclusive():
-            self._backend, self._sample_backend = backend, None
+            self._backend = backend
 
     def __enter__(self) -> GroundSegmenter:
         """Return the segmenter itself: as a context manager it has nothing to end."""
@@ -234,18 +244,19 @@ class GroundSegmenter:
         Its angles are those given, estimated or of `fallback`.
         """
         backend, config, given = self._backend, self._config, given_pose(sensor)
-        scan = backend.build_grid(given.level(xyz), config)
+        level = given.level(xyz)
+        scan = backend.build_grid(level, config)
         timer.mark('grid')
-
-        def scan_rotated(matrix: FloatArray) -> Scan:
-            # `backend` would overwrite the scan in its buffers.
-            if self._sample_backend is None:
-                runtime = dataclasses.replace(config.runtime, backend=backend.name)
-                self._sample_backend = make_backend(runtime)
-            sample = rotate_sample(scan.xyz, matrix)
-            return self._sample_backend.build_grid(sample, config)
-
-        pose = estimate_pose(scan, sensor, backend.fit_plane, scan_rotated)
+        origin, elsewhere = origin_of(sensor), None
+        below = view = self._look(scan, UPRIGHT, origin)
+        if is_doubtful(below):
+            view = self._find_ground(level, below, origin)
+            scan = backend.build_grid(level, config)  # its buffers have been used
+        if view is not None and not view.can_level:
+            # The scan will not be levelled: the ground that matters is about level.
+            elsewhere = view if view.tells_tilt else None
+            view = self._look(scan, UPRIGHT, origin, CLEAR_TILT) or below
+        pose = estimate_pose(scan.candidates, sensor, view, elsewhere)
         if fallback is not None:
             pose = with_fallback(pose, fallback, sensor)
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
@@ -255,6 +266,34 @@ class GroundSegmenter:
             scan = backend.build_grid(images.raised(scan.xyz), config)
         timer.mark('pose')
         return scan, pose, images
+
+    def _look(
+        self, scan: Scan, turn: FloatArray, origin: Direction, max_tilt: float = MAX_TILT
+    ) -> View | None:
+        """Plane of a scan that `turn` has rotated; `origin` is where the sensor was before."""
+        x, y, z = (turn @ origin).tolist()
+        plane = self._backend.fit_plane(scan.candidates, math.tan(max_tilt), (x, y, z))
+        return None if plane is None else view_of(plane, scan, turn, (x, y, z))
+
+    def _views(
+        self, xyz: PointArray, turns: Iterable[FloatArray], origin: Direction
+    ) -> Iterator[View]:
+        """Plane of the points, rotated by each of `turns`, where there is one."""
+        for turn in turns:
+            scan = self._backend.build_grid(rotate(xyz, turn), self._config)
+            view = self._look(scan, turn, origin)
+            if view is not None:
+                yield view
+
+    def _find_ground(self, xyz: PointArray, below: View | None, origin: Direction) -> View | None:
+        """Plane of the ground, about z or another axis; that `below` z is doubtful."""
+        sample = xyz[:: len(xyz) // ENOUGH_POINTS + 1]
+        if below is not None and below.is_steep:
+            below = next(self._views(sample, [below.levelled], origin), below)
+        if not is_doubtful(below):
+            return below
+        first = self._views(sample, OTHER_AXES, origin)
+        return clearest(below, self._views(sample, [view.levelled for view in first], origin))
 
 
 def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[float, ...]:

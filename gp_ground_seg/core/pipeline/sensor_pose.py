@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.frame import Candidates, FloatArray, PointArray, Scan, usual_errors
+from gp_ground_seg.core.frame import Candidates, FloatArray, PointArray, usual_errors
 from gp_ground_seg.core.parameters.config import SensorConfig
 from gp_ground_seg.core.parameters.schema import AUTO
 from gp_ground_seg.core.pipeline.ground_plane import (
-    FARTHEST,
     GroundPlane,
     Plane,
     plane_across,
@@ -31,18 +29,11 @@ from gp_ground_seg.core.pipeline.tilt import (
     vertical,
 )
 from gp_ground_seg.core.pipeline.up_axis import (
-    MIN_CLEARANCE,
     MIN_COVERAGE,
-    UP_MAX_TILT,
     View,
-    find_up_axis,
-    is_up_axis_doubtful,
     is_well_supported,
     refusal,
 )
-
-FitPlane = Callable[[Candidates, float, Direction], GroundPlane | None]
-ScanRotated = Callable[[FloatArray], Scan]
 
 DEFAULT_HEIGHT = 1.73
 """Height where `sensor.height` is auto and the scan does not determine it: a car's roof [m]."""
@@ -70,12 +61,6 @@ LITTLE_GROUND = (
 CLEAR_TILT = 0.05
 """Tilt from which roll and pitch that are auto level the scan [rad]: camber and a vehicle's own
 lean stay below it."""
-MAX_TILT = math.radians(30.0)
-"""Steepest ground plane that is searched [rad]."""
-
-CLEAR = 0.3
-"""Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
-seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
 LEAST_COSINE = 0.1
 """Cosine of the tilt from which the sensor's z axis meets the ground."""
 HEIGHT_CONTRADICTION = 0.3
@@ -190,18 +175,19 @@ def given_pose(sensor: SensorConfig) -> SensorPose:
 
 
 def estimate_pose(
-    scan: Scan, sensor: SensorConfig, fit_plane: FitPlane, scan_rotated: ScanRotated
+    candidates: Candidates, sensor: SensorConfig, view: View | None, elsewhere: View | None
 ) -> SensorPose:
     """Estimate what is auto, and check what is not against the scan.
 
-    `scan` is in the frame levelled by `given_pose`; `fit_plane` is that of `ground_plane`, and
-    `scan_rotated` returns the same scan, rotated further by a matrix (3, 3): it is called only
-    where z does not seem to be up. Raises a PointCloudError if roll or pitch is auto and z is
-    clearly not up.
+    `candidates` are in the frame levelled by `given_pose`, and `view` is the plane of the ground;
+    `elsewhere` is where it clearly lies if that is too far from z. Raises a PointCloudError if
+    it is, and roll or pitch is auto.
     """
-    given = given_pose(sensor)
-    view, not_up = _find_ground(scan, sensor, fit_plane, scan_rotated)
-    contradictions = () if not_up is None else (not_up,)
+    given, contradictions = given_pose(sensor), tuple[str, ...]()
+    if elsewhere is not None:
+        contradictions = (refusal(elsewhere, given.rotation),)
+        if AUTO in (sensor.roll, sensor.pitch):
+            raise PointCloudError(*contradictions)
     if view is None:
         return dataclasses.replace(given, contradictions=contradictions)
     plane, tells_height, tells_tilt = view.plane, view.tells_height, view.tells_tilt
@@ -225,7 +211,8 @@ def estimate_pose(
         roll_estimated=sensor.roll == AUTO and corrects,
         pitch_estimated=sensor.pitch == AUTO and corrects,
         measured=measured,
-        contradictions=contradictions or _contradictions(scan, sensor, measured, view, level),
+        contradictions=contradictions
+        or _contradictions(candidates, sensor, measured, view, level),
         is_height_default=sensor.height == AUTO and not tells_height,
         doubts=_doubts(sensor, view) if estimates_height else (),
     )
@@ -252,63 +239,16 @@ def _doubts(sensor: SensorConfig, view: View) -> tuple[str, ...]:
     """Say why the height of the plane of `view` may not be that of the ground."""
     plane = view.plane
     is_little = plane.n_support < FEW_CELLS or plane.coverage < MIN_COVERAGE
-    clearance = plane.near_height * plane.normal[2] + _product(view.up, _origin(sensor))
+    clearance = plane.near_height * plane.normal[2] + _product(view.up, origin_of(sensor))
     is_low = 0.0 < clearance < LOW and plane.depression >= LEAST_DEPRESSION
     return (LOW_GROUND,) * is_low + (LITTLE_GROUND,) * is_little
 
 
-def _origin(sensor: SensorConfig) -> Direction:
+def origin_of(sensor: SensorConfig) -> Direction:
     """Place of the sensor in the frame levelled by `given_pose` [m]."""
     place = given_pose(sensor).rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)
     x, y, z = place.tolist()
     return x, y, z
-
-
-def _find_ground(
-    scan: Scan, sensor: SensorConfig, fit_plane: FitPlane, scan_rotated: ScanRotated
-) -> tuple[View | None, str | None]:
-    """Plane of the ground below z, or where z does not seem to be up of the axis that is.
-
-    The second says where the ground is if that axis is too far from z to be levelled.
-    """
-    given, origin = given_pose(sensor), _origin(sensor)
-
-    def look(turn: FloatArray | None, max_tilt: float) -> View | None:
-        turned = scan if turn is None else scan_rotated(turn)
-        x, y, z = origin if turn is None else (turn @ origin).tolist()
-        plane = fit_plane(turned.candidates, math.tan(max_tilt), (x, y, z))
-        if plane is None:
-            return None
-        clearance = float(plane.below(x, y, z))
-        # No ground is above the sensor: roofs of cars, of whose ground little is seen, are.
-        if turn is not None and clearance < -MIN_CLEARANCE:
-            return None
-        is_below = clearance >= MIN_CLEARANCE
-        if not is_below and not _is_lower_side(plane, turned):
-            return None
-        up = plane.normal if turn is None else turned_back(plane.normal, turn)
-        return View(plane, up, is_below)
-
-    view = look(None, MAX_TILT)
-    plane_below = None if view is None else view.plane
-    found = find_up_axis(plane_below, look) if is_up_axis_doubtful(plane_below) else None
-    if found is None:
-        if view is not None and not view.tells_tilt:
-            # The scan will not be levelled: the ground that matters is about level.
-            return look(None, CLEAR_TILT) or view, None
-        return view, None
-    if found.up[2] >= math.cos(UP_MAX_TILT):
-        return found, None
-    not_up = refusal(found, given.rotation)
-    if AUTO in (sensor.roll, sensor.pitch):
-        raise PointCloudError(not_up)
-    return view, not_up
-
-
-def _is_lower_side(plane: GroundPlane, scan: Scan) -> bool:
-    """Whether more returns are clearly above the plane than below it."""
-    height = plane.below(*scan.xyz[scan.grid.r < FARTHEST].T.astype(np.float64))
-    return bool(np.count_nonzero(height > CLEAR) > np.count_nonzero(height < -CLEAR))
 
 
 def _levelled(up: Direction, sensor: SensorConfig) -> tuple[float, float]:
@@ -328,15 +268,19 @@ def _angle(a: Direction, b: Direction) -> float:
     return math.acos(min(max(_product(a, b), -1.0), 1.0))
 
 
-def _shows_level(scan: Scan, level: Plane, view: View) -> bool:
+def _shows_level(candidates: Candidates, level: Plane, view: View) -> bool:
     """Whether a scan shows a level plane as well, beside that of `view`."""
     found = plane_across(view.up, view.plane.near_height * view.plane.normal[2])
-    support, support_found = supports_in(scan.candidates, [level, found])
+    support, support_found = supports_in(candidates, [level, found])
     return bool(support >= ALSO_SEEN * support_found)
 
 
 def _contradictions(
-    scan: Scan, sensor: SensorConfig, measured: MeasuredPose, view: View, level: Direction
+    candidates: Candidates,
+    sensor: SensorConfig,
+    measured: MeasuredPose,
+    view: View,
+    level: Direction,
 ) -> tuple[str, ...]:
     """Say which parameters are clearly wrong; `level` is the vertical of the pose used."""
     found = []
@@ -344,7 +288,7 @@ def _contradictions(
     if tells_height and sensor.height != AUTO:
         difference = abs(sensor.height - measured.height)
         is_far = difference > max(HEIGHT_CONTRADICTION, 0.1 * abs(sensor.height))
-        if is_far and not _shows_level(scan, plane_across(level, sensor.height), view):
+        if is_far and not _shows_level(candidates, plane_across(level, sensor.height), view):
             side = 'below' if measured.height >= 0.0 else 'above'
             found.append(
                 f'sensor.height = {sensor.height:g}: the ground near the sensor is '

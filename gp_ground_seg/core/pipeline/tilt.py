@@ -58,11 +58,6 @@ def rotate(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
     return result
 
 
-def rotate_sample(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
-    """Every n-th point turned, about `ENOUGH_POINTS` of them."""
-    return rotate(xyz[:: len(xyz) // ENOUGH_POINTS + 1], matrix)
-
-
 def angles_of(up: FloatArray | Direction) -> tuple[float, float]:
     """Roll and pitch [rad] of a sensor in whose frame the unit vector `up` (3,) points up.
 

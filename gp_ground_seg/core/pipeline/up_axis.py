@@ -1,16 +1,16 @@
-"""Stage 2: whether a plane is ground, and whether the ground lies along another axis than z."""
+"""Stage 2: planes that may be the ground, and whether it lies along another axis than z."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import FloatArray
-from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.core.pipeline.tilt import Direction, angles_of, rotation
+from gp_ground_seg.core.frame import FloatArray, Scan
+from gp_ground_seg.core.pipeline.ground_plane import FARTHEST, GroundPlane
+from gp_ground_seg.core.pipeline.tilt import Direction, angles_of, rotation, turned_back
 
 MIN_SUPPORT = 0.35
 """Share of the lowest points on the plane from which a scan determines the tilt."""
@@ -32,39 +32,41 @@ MIN_COVERAGE = 0.25
 MIN_REACH = 5.0
 """Range that the ground must reach for the same [m]."""
 
-UP_MAX_TILT = math.radians(46.0)
-"""Angle from each axis within which up is searched; these cones cover all directions. A scan whose
-up lies in that of z is levelled, another refused."""
+MAX_TILT = math.radians(46.0)
+"""Angle from an axis within which a plane is searched; such cones about the six axes cover all
+directions. A scan whose ground is farther from z than that is not levelled but refused."""
+STEEP = math.radians(25.0)
+"""Tilt from which a plane is fitted again in a frame in which it is level: lowest points of a
+tilted frame are not all ground."""
 GOOD_SUPPORT = 0.9
 """Support of a `TALL` plane below z under which other axes are tried."""
 TALL = 6.0
 """Height from which the plane below z may well be a facade [m]."""
-UP_MIN_SUPPORT = 0.5
-"""Support from which a plane that is not below z shows where the ground is."""
-UP_SUPPORT_RATIO, UP_SUPPORT_RATIO_TALL = 2.0, 0.8
+SUPPORT_RATIO, SUPPORT_RATIO_TALL = 2.0, 0.8
 """Least support of another plane over that of the plane below z: near, and `TALL`."""
-UP_DISTANCE_RATIO = 3.0
+DISTANCE_RATIO = 3.0
 """Distance of a `TALL` plane over the largest of another one."""
-UP_FIRST_SUPPORT = 0.15
-"""Support from which a plane is fitted again in its own level frame."""
-UP_STEEP = math.radians(25.0)
-"""Tilt of the plane below z from which a better one is looked for in its own level frame: that
-plane may have stopped at `MAX_TILT`."""
-UP_MIN_CELLS = 60
-"""Lowest points that must exist for another plane to count."""
-UP_MIN_FAR_COVERAGE = 0.5
+OTHER_MIN_SUPPORT, OTHER_MIN_CELLS = 0.5, 60
+"""Support, and lowest points seen, from which a plane that is not below z shows the ground."""
+OTHER_MIN_FAR_COVERAGE = 0.5
 """Share of the sectors in which it must reach far: the ceiling of a room does not."""
+CLEAR = 0.3
+"""Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
+seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
 
 _QUARTER = math.pi / 2.0
-_AXES = (
-    (0.0, 0.0),
-    (math.pi, 0.0),
-    (_QUARTER, 0.0),
-    (-_QUARTER, 0.0),
-    (0.0, _QUARTER),
-    (0.0, -_QUARTER),
+UPRIGHT, *OTHER_AXES = (
+    rotation(roll, pitch)
+    for roll, pitch in (
+        (0.0, 0.0),
+        (math.pi, 0.0),
+        (_QUARTER, 0.0),
+        (-_QUARTER, 0.0),
+        (0.0, _QUARTER),
+        (0.0, -_QUARTER),
+    )
 )
-"""Roll and pitch that turn each of the six axes up [rad]."""
+"""Rotations (3, 3) that turn z up, and each of the five other axes."""
 
 
 def is_well_supported(plane: GroundPlane) -> bool:
@@ -73,18 +75,43 @@ def is_well_supported(plane: GroundPlane) -> bool:
 
 
 class View(NamedTuple):
-    """The plane of the ground, seen from a frame in which it is about level."""
+    """A plane of a scan, seen from a frame in which it may be level."""
 
     plane: GroundPlane
-    up: Direction  # its normal, in the frame levelled by the parameters
-    is_below: bool  # whether it lies below the sensor
+    turn: FloatArray  # (3, 3) rotation to that frame from the one levelled by the parameters
+    clearance: float  # how far the plane is below the sensor there [m]
+
+    @property
+    def up(self) -> Direction:
+        """Normal of the plane, in the frame levelled by the parameters."""
+        return turned_back(self.plane.normal, self.turn)
+
+    @property
+    def levelled(self) -> FloatArray:
+        """Rotation (3, 3) as `turn`, to a frame in which the plane is level."""
+        return rotation(*angles_of(self.up))
+
+    @property
+    def is_steep(self) -> bool:
+        """Whether the plane is clearly tilted against the frame that it was fitted in."""
+        return self.plane.normal[2] < math.cos(STEEP)
+
+    @property
+    def is_tall(self) -> bool:
+        """Whether the plane may well be a facade."""
+        return self.plane.height > TALL
+
+    @property
+    def can_level(self) -> bool:
+        """Whether it is enough ground to level the scan by, and z not too far from its normal."""
+        return self.tells_tilt and self.up[2] >= math.cos(MAX_TILT)
 
     @property
     def tells_height(self) -> bool:
         """Whether it is ground for sure."""
-        plane = self.plane
-        is_seen_from_above = self.is_below and plane.spread >= MIN_SPREAD
-        is_floor = self.is_below and plane.spread >= SHALLOW_SPREAD and plane.depth >= SHALLOW
+        plane, is_below = self.plane, self.clearance >= MIN_CLEARANCE
+        is_seen_from_above = is_below and plane.spread >= MIN_SPREAD
+        is_floor = is_below and plane.spread >= SHALLOW_SPREAD and plane.depth >= SHALLOW
         return plane.n_support >= MIN_CELLS and (
             is_seen_from_above
             or (
@@ -96,7 +123,7 @@ class View(NamedTuple):
 
     @property
     def tells_tilt(self) -> bool:
-        """Whether it is enough ground to level the scan by."""
+        """Whether it is enough ground to tell the tilt."""
         plane = self.plane
         return (
             self.tells_height
@@ -106,60 +133,52 @@ class View(NamedTuple):
         )
 
 
-Look = Callable[[FloatArray | None, float], View | None]
-"""Returns the plane of the scan rotated by a matrix (3, 3), tilted there by an angle at most."""
+def view_of(plane: GroundPlane, scan: Scan, turn: FloatArray, origin: Direction) -> View | None:
+    """View of a plane of `scan`, where the sensor is at `origin`; None of a ceiling."""
+    clearance = float(plane.below(*origin))
+    if clearance < MIN_CLEARANCE and not _is_lower_side(plane, scan):
+        return None
+    return View(plane, turn, clearance)
 
 
-def is_up_axis_doubtful(plane: GroundPlane | None) -> bool:
+def _is_lower_side(plane: GroundPlane, scan: Scan) -> bool:
+    """Whether more returns are clearly above the plane than below it."""
+    height = plane.below(*scan.xyz[scan.grid.r < FARTHEST].T.astype(np.float64))
+    return bool(np.count_nonzero(height > CLEAR) > np.count_nonzero(height < -CLEAR))
+
+
+def is_doubtful(below: View | None) -> bool:
     """Whether the plane below z is so poor, or so far away, that z may not be up."""
     return (
-        plane is None
-        or not is_well_supported(plane)
-        or _is_steep(plane)
-        or (_is_tall(plane) and plane.support < GOOD_SUPPORT)
+        below is None
+        or below.is_steep
+        or not is_well_supported(below.plane)
+        or (below.is_tall and below.plane.support < GOOD_SUPPORT)
     )
 
 
-def _is_steep(plane: GroundPlane) -> bool:
-    return plane.normal[2] < math.cos(UP_STEEP)
-
-
-def _is_tall(plane: GroundPlane | None) -> bool:
-    return plane is not None and plane.height > TALL
+def clearest(below: View | None, others: Iterable[View]) -> View | None:
+    """Return the one of `others` that clearly is the ground, if `below`, about z, is not."""
+    needed, farthest = 0.0, math.inf
+    if below is not None:
+        ratio = SUPPORT_RATIO_TALL if below.is_tall else SUPPORT_RATIO
+        needed = ratio * below.plane.support
+        farthest = below.plane.height / DISTANCE_RATIO if below.is_tall else math.inf
+    found = [v for v in others if v.plane.height <= farthest and _is_ground(v, needed)]
+    return max(found, key=lambda view: view.plane.support, default=below)
 
 
 def _is_ground(view: View, support: float) -> bool:
+    """Whether a plane about another axis than z shows the ground, with `support` at least."""
     plane = view.plane
-    if plane.support < support or plane.n_cells < UP_MIN_CELLS:
-        return False
-    if view.up[2] >= math.cos(UP_MAX_TILT):
-        return view.tells_tilt
     return (
-        view.tells_height
-        and plane.support >= UP_MIN_SUPPORT
-        and plane.coverage >= MIN_COVERAGE
-        and plane.far_coverage >= UP_MIN_FAR_COVERAGE
+        view.tells_tilt
+        # No ground is above the sensor: roofs of cars, of whose ground little is seen, are.
+        and view.clearance >= -MIN_CLEARANCE
+        and plane.support >= max(support, OTHER_MIN_SUPPORT)
+        and plane.n_cells >= OTHER_MIN_CELLS
+        and plane.far_coverage >= OTHER_MIN_FAR_COVERAGE
     )
-
-
-def find_up_axis(plane: GroundPlane | None, look: Look) -> View | None:
-    """Return the ground where it clearly lies, if the `plane` below z is not it, or None."""
-    support = 0.0 if plane is None or _is_steep(plane) else plane.support
-    ratio = UP_SUPPORT_RATIO_TALL if _is_tall(plane) else UP_SUPPORT_RATIO
-    needed = ratio * support
-    farthest = (
-        plane.height / UP_DISTANCE_RATIO if plane is not None and _is_tall(plane) else math.inf
-    )
-    found = []
-    for angles in _AXES:
-        first = look(rotation(*angles), UP_MAX_TILT)
-        if first is None or first.plane.support < UP_FIRST_SUPPORT:
-            continue
-        # Fit again with that plane level: lowest points of a tilted frame are not all ground.
-        view = look(rotation(*angles_of(first.up)), UP_MAX_TILT)
-        if view is not None and view.plane.height <= farthest and _is_ground(view, needed):
-            found.append(view)
-    return max(found, key=lambda view: view.plane.support * view.plane.far_coverage, default=None)
 
 
 def refusal(view: View, given: FloatArray) -> str:
