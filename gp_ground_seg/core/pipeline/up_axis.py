@@ -42,8 +42,8 @@ GOOD_SUPPORT = 0.9
 """Support of a `TALL` plane below z under which other axes are tried."""
 TALL = 6.0
 """Height from which the plane below z may well be a facade [m]."""
-SUPPORT_RATIO, SUPPORT_RATIO_TALL = 2.0, 0.8
-"""Least support of another plane over that of the plane below z: near, and `TALL`."""
+SUPPORT_RATIO = 0.8
+"""Least support of another plane over that of the plane below z."""
 DISTANCE_RATIO = 3.0
 """Distance of a `TALL` plane over the largest of another one."""
 OTHER_MIN_SUPPORT, OTHER_MIN_CELLS = 0.5, 60
@@ -159,26 +159,22 @@ def is_doubtful(below: View | None) -> bool:
 
 def clearest(below: View | None, others: Iterable[View]) -> View | None:
     """Return the one of `others` that clearly is the ground, if `below`, about z, is not."""
-    needed, farthest = 0.0, math.inf
+    support, farthest = OTHER_MIN_SUPPORT, math.inf
     if below is not None:
-        ratio = SUPPORT_RATIO_TALL if below.is_tall else SUPPORT_RATIO
-        needed = ratio * below.plane.support
-        farthest = below.plane.height / DISTANCE_RATIO if below.is_tall else math.inf
-    found = [v for v in others if v.plane.height <= farthest and _is_ground(v, needed)]
-    return max(found, key=lambda view: view.plane.support, default=below)
-
-
-def _is_ground(view: View, support: float) -> bool:
-    """Whether a plane about another axis than z shows the ground, with `support` at least."""
-    plane = view.plane
-    return (
-        view.tells_tilt
+        support = max(support, SUPPORT_RATIO * below.plane.support)
+        farthest = below.plane.height / DISTANCE_RATIO if below.is_tall else farthest
+    found = [
+        view
+        for view in others
+        if view.tells_tilt
         # No ground is above the sensor: roofs of cars, of whose ground little is seen, are.
         and view.clearance >= -MIN_CLEARANCE
-        and plane.support >= max(support, OTHER_MIN_SUPPORT)
-        and plane.n_cells >= OTHER_MIN_CELLS
-        and plane.far_coverage >= OTHER_MIN_FAR_COVERAGE
-    )
+        and view.plane.height <= farthest
+        and view.plane.support >= support
+        and view.plane.n_cells >= OTHER_MIN_CELLS
+        and view.plane.far_coverage >= OTHER_MIN_FAR_COVERAGE
+    ]
+    return max(found, key=lambda view: view.plane.support, default=below)
 
 
 def refusal(view: View, given: FloatArray) -> str:
@@ -187,8 +183,10 @@ def refusal(view: View, given: FloatArray) -> str:
     roll, pitch = (round(angle, 3) + 0.0 for angle in angles_of(up))
     largest = int(np.argmax(np.abs(up)))
     axis = f'{"-" if up[largest] < 0.0 else ""}{"xyz"[largest]}'
+    tilt = math.degrees(math.acos(min(up[2], 1.0)))
+    problem = f'z is tilted by {tilt:.0f} degrees' if axis == 'z' else 'z does not point up'
     height = view.plane.height * view.plane.normal[2]
     return (
-        f'z does not point up: the ground seems to be {height:.2f} m away with {axis} up; turn '
+        f'{problem}: the ground seems to be {height:.2f} m away with {axis} up; turn '
         f'the cloud, or set sensor.roll to {roll:.3f} and sensor.pitch to {pitch:.3f} [rad]'
     )
