@@ -233,6 +233,32 @@ def test_a_large_tilt_is_levelled(sensor, degrees):
         assert math.acos(min(lean, 1.0)) < 0.03
 
 
+@pytest.mark.parametrize(
+    ('degrees', 'start'),
+    [((50.0, 0.0), 'z does not point up: '), ((33.5, 35.0), 'z is tilted by 47 degrees: ')],
+)
+def test_a_tilt_beyond_46_degrees_is_refused_with_its_angles(degrees, start):
+    roll, pitch = map(math.radians, degrees)
+    points = tilted(scan_of('urban', SMALL_OS1, 1.5).points, roll, pitch)
+    line, angles = refusal(points, start)
+    np.testing.assert_allclose(angles, (roll, pitch), atol=0.03)
+    told = segmenter(roll=angles[0], pitch=angles[1]).segment(points).pose
+    assert told.contradictions == () and told.height == pytest.approx(1.5, abs=0.15)
+    (contradiction,) = pose_of(points, roll=0.0, pitch=0.0).contradictions
+    assert contradiction == line
+
+
+def test_a_search_leaves_the_buffers_of_the_scan_as_they_were():
+    """What is steep is looked at again in buffers that the scan lies in."""
+    lean = tilted(scan_of('urban', SMALL_OS1, 1.5).points, math.radians(35.0), 0.0)
+    fast, plain = (
+        segmenter(backend, roll=0.0, pitch=0.0).segment(lean)
+        for backend in (BACKEND, NumpyBackend())
+    )
+    assert fast.pose.contradictions and fast.pose.is_level
+    assert (fast.label != plain.label).mean() < 1e-4
+
+
 def test_a_room_too_small_to_see_the_floor_determines_nothing_and_that_is_said_once(caplog):
     """Walls cut by the lowest beam alone are no plane; the default is said to be one."""
     closet = room('closet', [(-1.5, -1.0), (1.5, -1.0), (1.5, 2.0), (-1.5, 2.0)])
@@ -346,12 +372,12 @@ UPS = {
 }
 
 
-def refusal(points):
+def refusal(points, start='z does not point up: '):
     """Message of the refusal, and the angles that it says to set."""
     with pytest.raises(PointCloudError) as caught:
         pose_of(points)
     line = str(caught.value)
-    assert line.startswith('z does not point up: ') and '\n' not in line
+    assert line.startswith(start) and '\n' not in line
     angles = (line.split(f'sensor.{name} to ')[1].split()[0] for name in ('roll', 'pitch'))
     return line, tuple(map(float, angles))
 
