@@ -20,7 +20,7 @@ from evaluation_samples import label_files
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.log import in_thousands
-from gp_ground_seg.core.pipeline.tilt import rotation
+from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.data.bags import BagReader, BagWriter
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan

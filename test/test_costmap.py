@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.pipeline.tilt import rotation
+from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.data import costmap
 from gp_ground_seg.data.costmap import DIRECTIONS, FREE, OCCUPIED, UNKNOWN, Placement
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, Kind, simulate_scan

@@ -12,7 +12,7 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import at_points
 from gp_ground_seg.core.ground_model import GroundModel
-from gp_ground_seg.core.pipeline.tilt import rotation
+from gp_ground_seg.core.pipeline.points import rotation
 
 # No neighbours, so that segments without a model stay without one; r_min of 0 is the hard case.
 CONFIGS = [

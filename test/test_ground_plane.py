@@ -21,7 +21,7 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     RING_EDGES,
     solve_plane,
 )
-from gp_ground_seg.core.pipeline.tilt import rotation
+from gp_ground_seg.core.pipeline.points import rotation
 
 BACKENDS = NumpyBackend(), NumbaBackend()
 ORIGIN = (0.0, 0.0, 0.0)

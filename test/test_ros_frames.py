@@ -25,7 +25,7 @@ from test_sensor_pose import ROOM
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.core.pipeline.tilt import rotation
+from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.lab.simulation import VLP_16, simulate_scan
 from gp_ground_seg.ros import transforms
 from gp_ground_seg.ros.ground_model import read_ground_model

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.core.pipeline.tilt import rotation
+from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.data import costmap, step_edges
 from gp_ground_seg.data.costmap import DIRECTIONS, OCCUPIED, Placement, SegmentedCloud
 from gp_ground_seg.data.step_edges import SECTORS, find_edges

@@ -31,8 +31,8 @@ from gp_ground_seg.core.pipeline import (
     relief,
     vertical_faces,
 )
+from gp_ground_seg.core.pipeline.points import Direction
 from gp_ground_seg.core.pipeline.relief import Relief
-from gp_ground_seg.core.pipeline.tilt import Direction
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 _warned_slow = False

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import FloatArray, usual_errors
-from gp_ground_seg.core.pipeline.tilt import rotation
+from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.core.result import Segmentation
 
 N_ITERATIONS = 12

@@ -26,7 +26,7 @@ from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
 from gp_ground_seg.core.pipeline.mirror_images import MirrorImages, find_mirror_images
-from gp_ground_seg.core.pipeline.points import take_points
+from gp_ground_seg.core.pipeline.points import ENOUGH_POINTS, Direction, rotate, take_points
 from gp_ground_seg.core.pipeline.sensor_pose import (
     CLEAR_TILT,
     SensorPose,
@@ -35,7 +35,6 @@ from gp_ground_seg.core.pipeline.sensor_pose import (
     origin_of,
     with_fallback,
 )
-from gp_ground_seg.core.pipeline.tilt import ENOUGH_POINTS, Direction, rotate
 from gp_ground_seg.core.pipeline.up_axis import (
     MAX_TILT,
     OTHER_AXES,

@@ -15,7 +15,7 @@ from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from gp_ground_seg.core.frame import NOT_FINITE, BoolArray
-from gp_ground_seg.core.pipeline.tilt import rotate
+from gp_ground_seg.core.pipeline.points import rotate
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.costmap import (
     DIRECTIONS,

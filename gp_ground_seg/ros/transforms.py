@@ -17,8 +17,8 @@ from std_msgs.msg import Header
 from gp_ground_seg.core.errors import MissingDependencyError, PointCloudError
 from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.core.parameters.config import NO_FRAME, Config
+from gp_ground_seg.core.pipeline.points import angles_of
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
-from gp_ground_seg.core.pipeline.tilt import angles_of
 from gp_ground_seg.data.costmap import Placement
 from gp_ground_seg.ros.input import STEADY_CLOCK
 

@@ -46,10 +46,9 @@ from gp_ground_seg.core.parameters.number_tuples import numbers_of
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.labels import depth_of_ground, lowest_of, sum_units
 from gp_ground_seg.core.pipeline.lines import lines_through
-from gp_ground_seg.core.pipeline.points import copy_points, points_in
+from gp_ground_seg.core.pipeline.points import Direction, copy_points, points_in
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
 from gp_ground_seg.core.pipeline.relief import Relief
-from gp_ground_seg.core.pipeline.tilt import Direction
 
 
 class NumbaBackend:

@@ -29,7 +29,7 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     tukey_weight,
     weight_at,
 )
-from gp_ground_seg.core.pipeline.tilt import Direction
+from gp_ground_seg.core.pipeline.points import Direction
 
 WIDTH = 32
 """The number of points ends at a multiple of it, so that no loop over them has a remainder."""

@@ -11,7 +11,7 @@ import numpy as np
 from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray, Values
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import SENSOR_HEIGHTS
-from gp_ground_seg.core.pipeline.tilt import Direction
+from gp_ground_seg.core.pipeline.points import Direction
 
 N_SECTORS = 36
 NEAREST, FARTHEST = 0.5, 40.0

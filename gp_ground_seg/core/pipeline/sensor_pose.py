@@ -19,7 +19,7 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     plane_across,
     supports_in,
 )
-from gp_ground_seg.core.pipeline.tilt import (
+from gp_ground_seg.core.pipeline.points import (
     Direction,
     angles_of,
     rotate,

@@ -10,7 +10,7 @@ import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Scan
 from gp_ground_seg.core.pipeline.ground_plane import FARTHEST, GroundPlane
-from gp_ground_seg.core.pipeline.tilt import Direction, angles_of, rotation, turned_back
+from gp_ground_seg.core.pipeline.points import Direction, angles_of, rotation, turned_back
 
 MIN_SUPPORT = 0.35
 """Share of the lowest points on the plane from which a scan determines the tilt."""
@@ -46,8 +46,8 @@ SUPPORT_RATIO = 0.8
 """Least support of another plane over that of the plane below z."""
 DISTANCE_RATIO = 3.0
 """Distance of a `TALL` plane over the largest of another one."""
-OTHER_MIN_SUPPORT, OTHER_MIN_CELLS = 0.5, 60
-"""Support, and lowest points seen, from which a plane that is not below z shows the ground."""
+OTHER_MIN_SUPPORT = 0.5
+"""Support from which a plane that is not below z shows where the ground is."""
 OTHER_MIN_FAR_COVERAGE = 0.5
 """Share of the sectors in which it must reach far: the ceiling of a room does not."""
 CLEAR = 0.3
@@ -171,7 +171,6 @@ def clearest(below: View | None, others: Iterable[View]) -> View | None:
         and view.clearance >= -MIN_CLEARANCE
         and view.plane.height <= farthest
         and view.plane.support >= support
-        and view.plane.n_cells >= OTHER_MIN_CELLS
         and view.plane.far_coverage >= OTHER_MIN_FAR_COVERAGE
     ]
     return max(found, key=lambda view: view.plane.support, default=below)
