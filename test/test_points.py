@@ -45,3 +45,44 @@ def test_points_farther_than_a_sensor_measures(share, is_refused):
                 points.take_points(placed)
         else:
             assert len(points.take_points(placed)) == len(scan)
+
+
+MOUNT = 0.9, -0.3, 1.73
+
+
+@pytest.mark.parametrize('dtype', ['f4', '>f4', 'f8', 'f2'])
+@pytest.mark.parametrize('origin', [(0.0, 0.0, 0.0), MOUNT, (0.0, 1e-17, 1.73)])
+def test_points_at_the_sensor_become_nan(dtype, origin):
+    rng = np.random.default_rng(0)
+    array = rng.uniform(-9.0, 9.0, (400, 4)).astype(dtype)
+    array[:9, :3], array[9:20, :3], array[20, :3] = 0.0, origin, -0.0
+    array[9:20, 1] *= abs(origin[1]) > 1e-9  # TF is a rounding beside the driver's zero
+    for k in range(3):  # near it, or with two coordinates of it
+        array[21 + k, :3] = origin
+        array[21 + k, k] += 0.02
+    before = array.copy()
+    taken = points.take_points(array, origin)
+    np.testing.assert_array_equal(np.isnan(taken).all(axis=1), np.arange(400) < 21)
+    np.testing.assert_array_equal(taken[21:], points.take_points(array)[21:])
+    np.testing.assert_array_equal(array, before)
+    # Rounded to single precision once, and of another type now.
+    single = array.astype('f4').astype('f8') if dtype != 'f2' else array
+    np.testing.assert_array_equal(
+        np.isnan(points.take_points(single, origin)[:, 0]), np.arange(400) < 21
+    )
+    assert np.shares_memory(points.take_points(before[21:], origin), before) == (dtype in 'f4f8')
+
+
+def test_places_that_many_points_share_are_sensors():
+    rng = np.random.default_rng(0)
+    places = np.float32([MOUNT, (1.35, 0.5, 1.9), (6.0, 1.0, 0.0)])
+    for n_rings, share in ((64, 0.04), (40, 0.04), (1, 0.9), (1, 0.01)):
+        scan = rng.uniform(-20.0, 20.0, (40_000, 3)).astype('f4').round(2)
+        spot = rng.integers(3, size=40_000)
+        shared = rng.random(40_000) < 3.0 * share if n_rings == 1 else np.arange(40_000) % n_rings < 8
+        scan[shared] = places[spot[shared]]
+        empty = np.isnan(points.take_points(scan, (0.0, 0.0, 0.0))[:, 0])
+        # Not those that few points share, nor those that are farther away than a sensor.
+        np.testing.assert_array_equal(empty, shared & (spot < 2) & (share > 0.03))
+    few = np.tile(places[:1], (999, 1))
+    assert np.isfinite(points.take_points(few, (0.0, 0.0, 0.0))).all()

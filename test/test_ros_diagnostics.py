@@ -223,12 +223,13 @@ def status_of(points, **changes):
 
 def test_model_reports_the_newest_scan():
     xyz = hilly_scan()
-    xyz[:400, 2] = np.nan
+    xyz[:300, 2], xyz[300:400] = np.nan, 0.0
     xyz[400:600, :2] = [500.0, 0.0]  # beyond the grid: no model
     segmentation, status = status_of(xyz, **{'grid.n_segments': 24})
     values, fit = status.values, segmentation.fit
     assert values['Segments with a model'] == f'{fit.n_segments} of 24'
     assert float(values['Unknown fraction']) == 0.1
+    assert values['Points without a return'] == '400'
     assert float(values['Fraction without model']) >= 0.05
     assert 0.3 < float(values['Ground fraction']) < 0.9
     assert float(values['Noise (m)']) == pytest.approx(fit.theta['sigma_n'], rel=1e-3)

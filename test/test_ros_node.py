@@ -93,8 +93,8 @@ INPUT_KEYS = (
 )
 PROCESSING_KEYS = 'Clouds since startup; Dropped since startup; Median latency (ms); Backend'
 MODEL_KEYS = (
-    'Segments with a model; Ground fraction; Unknown fraction; Fraction without model; '
-    'Candidates; Inliers; '
+    'Segments with a model; Ground fraction; Unknown fraction; Points without a return; '
+    'Fraction without model; Candidates; Inliers; '
     'Sensor height (m); Sensor roll (rad); Sensor pitch (rad); Taken from the scan; '
     'Estimated height (m); Estimated roll (rad); Estimated pitch (rad); Noise (m); '
     'Learning mode; Learned since startup; Optimiser status; Evaluations; At bound; '

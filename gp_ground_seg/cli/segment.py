@@ -41,8 +41,8 @@ INPUT is a scan (.bin .pcd .ply .npy .npz), a folder or sequence of scans, a bag
 (.bag .mcap .db3, or a rosbag2 folder), several bags, or a KITTI_ROOT. docs/datasets.md has more
 on formats, and on whole data sets.
 
-A .bin gives a .label file: 40 = ground, 99 = obstacle, 0 = not finite (SemanticKITTI).
-Other scans keep their format and get label (1 ground, 2 obstacle, 0 not finite), height,
+A .bin gives a .label file: 40 = ground, 99 = obstacle, 0 = no return (SemanticKITTI).
+Other scans keep their format and get label (1 ground, 2 obstacle, 0 no return), height,
 ground_z, ground_std and p_ground. A bag gives a rosbag2 of the ground and the obstacles of each
 cloud.
 

@@ -28,7 +28,7 @@ Values = Any
 OUTSIDE = -1
 """Bin, cell and tile of a point that is beyond the grid."""
 NOT_FINITE = -2
-"""Cell of a point that is not finite."""
+"""Cell of a point that is not finite; what is no return has become so."""
 NO_TILE = 2**31 - 1
 """Tile of the lowest point of an empty cell."""
 

@@ -206,8 +206,8 @@ class Segmentation:
     def label(self) -> npt.NDArray[np.uint8]:
         """`gp_ground_seg.Label` of each point, (N,) uint8.
 
-        Finite points are GROUND or OBSTACLE; where there is no model nothing speaks
-        for ground, and they are OBSTACLE. Points that are not finite are UNKNOWN.
+        Returns are GROUND or OBSTACLE; where there is no model nothing speaks for ground, and
+        they are OBSTACLE. Points that are not finite, or exactly at the sensor, are UNKNOWN.
         """
         return self.labelled.label
 

@@ -102,7 +102,8 @@ class GroundSegmenter:
         Parameters
         ----------
         points : (N, >=3) float array
-            x forward, y left, z up in the sensor frame [m]; never written to.
+            x forward, y left, z up in the sensor frame [m]; never written to. A point exactly at
+            the origin of the cloud, or of the sensor, is no return: it is UNKNOWN, as NaN is.
         tilt : tuple of float, optional
             Roll and pitch of the sensor in this scan [rad], instead of ``sensor.roll``
             and ``sensor.pitch``.
@@ -131,7 +132,8 @@ class GroundSegmenter:
                 sensor = dataclasses.replace(sensor, origin_x=x, origin_y=y, origin_z=z)
             if not (fallback is None or isinstance(fallback, SensorPose)):
                 raise ConfigError(f'fallback = {_shortened(fallback)}: must be a SensorPose')
-            result = self._segment(take_points(points), sensor, timer, fallback)
+            place = sensor.origin_x, sensor.origin_y, sensor.origin_z
+            result = self._segment(take_points(points, place), sensor, timer, fallback)
             self._warn(result.warnings)
             return result
 

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import (
+    NOT_FINITE,
     BoolArray,
     FloatArray,
     GroundSurface,
@@ -141,6 +142,7 @@ class SegmentedCloud:
         # Rays begin at the sensor, which is not the origin of a cloud in the frame of a vehicle.
         with np.errstate(over='ignore', invalid='ignore'):
             xyz = (self.points - found.origin) @ found.pose.rotation.T
+        xyz[found.grid.cell == NOT_FINITE] = np.nan
         edges = find_edges(xyz, found.label == _GROUND, stands, output.max_step_down)
         return edges.points() @ found.pose.rotation + found.origin
 

@@ -222,6 +222,7 @@ class ModelTask:
             'Segments with a model': f'{fit.n_segments} of {len(scan.surface.mean)}',
             'Ground fraction': _digits(_mean(label == Label.GROUND), '.4f'),
             'Unknown fraction': _digits(_mean(label == Label.UNKNOWN), '.4f'),
+            'Points without a return': str(np.count_nonzero(label == Label.UNKNOWN)),
             'Fraction without model': _digits(without_model, '.4f'),
             'Candidates': str(fit.n_candidates),
             'Inliers': str(fit.n_inliers),

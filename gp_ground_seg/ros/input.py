@@ -17,6 +17,7 @@ from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.core.errors import ConfigError
 
+CLOUD_TYPE = 'sensor_msgs/msg/PointCloud2'
 INPUT_DEPTH = 5  # clouds that may wait to be processed: half a second of a LiDAR at 10 Hz
 OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 0.7 s only
 MAX_DEPTH = 10_000
@@ -26,6 +27,10 @@ NEAR = 1000  # gap in the numbers of several publishers up to which it counts as
 JUMP_TOLERANCE = 0.5  # stamps of several sensors on one topic may be that much out of order [s]
 NOTHING_ARRIVES = (
     'qos_overrides asks for reliable, and a publisher offers best effort: nothing arrives from it'
+)
+NO_TIME = (
+    'use_sim_time is true, and no time has come on /clock: start what publishes it, as play '
+    '--clock, or set use_sim_time to false'
 )
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)  # the clock of a node may stand or jump
 THROTTLED = {'throttle_duration_sec': 5.0, 'throttle_time_source_type': STEADY_CLOCK}
@@ -96,6 +101,7 @@ class CloudSubscription:
         self._why_idle = why_idle
         self._gaps = SequenceGaps()
         self._offered: dict[bytes, ReliabilityPolicy] = {}
+        self._foreign: set[str] = set()  # types of other messages that are sent on the topic
         self._large_size = 0
         self._unresolved_topic = topic
         self.topic: str = node.resolve_topic_name(topic)
@@ -139,11 +145,23 @@ class CloudSubscription:
     @property
     def fault(self) -> str:
         """What is wrong with the way clouds are received; empty if nothing."""
+        found = [self._fault_of_types] if self._foreign else []
         is_refused = ReliabilityPolicy.BEST_EFFORT in self._offered.values()
         if self._is_pinned and self._reliability == ReliabilityPolicy.RELIABLE and is_refused:
-            return NOTHING_ARRIVES
-        if not self._large_size:
-            return ''
+            found.append(NOTHING_ARRIVES)
+        elif self._large_size:
+            found.append(self._fault_of_size)
+        return '; '.join(found)
+
+    @property
+    def _fault_of_types(self) -> str:
+        return (
+            f'{" and ".join(sorted(self._foreign))} is sent there, and {CLOUD_TYPE} is wanted: '
+            'remap points to a topic of that type, or have the driver send it'
+        )
+
+    @property
+    def _fault_of_size(self) -> str:
         return (
             f'clouds of {self._large_size / 1e6:.1f} MB come best-effort, of which Fast DDS may '
             'lose most: let their publisher offer reliable, or start it with '
@@ -181,7 +199,7 @@ class CloudSubscription:
     def _check_size(self, size: int) -> None:
         if size > LARGE_CLOUD:
             self._large_size = size
-            self._node.get_logger().warning(f'on {self.topic}, {self.fault}', once=True)
+            self._node.get_logger().warning(f'on {self.topic}, {self._fault_of_size}', once=True)
 
     def _on_incompatible(self, _event: object) -> None:
         if self._is_pinned:
@@ -190,13 +208,16 @@ class CloudSubscription:
 
     def _look_at_publishers(self) -> bool:
         """Take note of the publishers; return whether they are others than at the last look."""
-        before, self._offered = (
-            self._offered.keys(),
-            {
-                bytes(entry.endpoint_gid): entry.qos_profile.reliability
-                for entry in self._node.get_publishers_info_by_topic(self.topic)
-            },
-        )
+        before, foreign = self._offered.keys(), self._foreign
+        entries = self._node.get_publishers_info_by_topic(self.topic)
+        self._foreign = {entry.topic_type for entry in entries} - {CLOUD_TYPE}
+        self._offered = {
+            bytes(entry.endpoint_gid): entry.qos_profile.reliability
+            for entry in entries
+            if entry.topic_type == CLOUD_TYPE
+        }
+        if self._foreign - foreign:
+            self._node.get_logger().warning(f'on {self.topic}, {self._fault_of_types}')
         is_changed = self._offered.keys() != before
         if is_changed:
             self._gaps.reset()
@@ -226,6 +247,12 @@ class CloudSubscription:
 def cloud_profile(depth: int = OUTPUT_DEPTH) -> QoSProfile:
     """Return the default of a topic on which clouds are sent: reliable, volatile, the newest."""
     return QoSProfile(depth=depth)
+
+
+def clock_fault(clock: Clock) -> str:
+    """Return what is wrong with the `clock` of a node; empty if nothing."""
+    is_waiting = clock.ros_time_is_active and clock.now().nanoseconds == 0
+    return NO_TIME if is_waiting else ''
 
 
 class TimeJumps:

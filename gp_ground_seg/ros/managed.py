@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
+from lifecycle_msgs.srv import ChangeState
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
+from gp_ground_seg.core.errors import shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.ros import node
 from gp_ground_seg.ros.heartbeat import NO_BOND, Heartbeat, find_message
+from gp_ground_seg.ros.input import THROTTLED
 from gp_ground_seg.ros.start_stop import StopRequest
 
 
@@ -30,6 +35,28 @@ class ManagedNode(LifecycleNodeMixin, node.GroundSegmentationNode):  # type: ign
         self._stop = stop
         node.GroundSegmentationNode.__init__(self, **options)
         LifecycleNodeMixin.__init__(self)
+        # Where a transition is impossible, rclpy's own callback raises, and nobody is answered.
+        for service in self.services:
+            if service.srv_type is ChangeState:
+                service.callback = partial(self._answer, service.callback)
+
+    def _answer(self, change: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
+        """Do what rclpy's callback `change` does; refuse a transition that there is not."""
+        try:
+            return change(request, response)
+        except rclpy_implementation.RCLError:
+            response.success = False
+            possible = ', '.join(
+                f'{number} ({label})'
+                for number, label, *_ in self._state_machine.available_transitions
+            )
+            wanted = f'{request.transition.id} {shown(request.transition.label)}'.strip()
+            self.get_logger().warning(
+                f'transition {wanted} refused: the node is '
+                f'{self._state_machine.current_state[1]}, where there are {possible or "none"}',
+                **THROTTLED,
+            )
+            return response
 
     def _load_backend(self, config: Config) -> None:
         if self._is_configured:

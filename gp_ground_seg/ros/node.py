@@ -27,7 +27,7 @@ from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.ros import start_stop
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts, kept_height
-from gp_ground_seg.ros.input import THROTTLED, CloudSubscription, TimeJumps
+from gp_ground_seg.ros.input import THROTTLED, CloudSubscription, TimeJumps, clock_fault
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
 from gp_ground_seg.ros.transforms import KeptPose, TfListener, is_tf_used, require_tf2
@@ -37,8 +37,8 @@ from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader
 class GroundSegmentationNode(ConfiguredNode):
     """Subscribes to ``points``, publishes ``ground``, ``obstacles`` and /diagnostics.
 
-    Each output keeps the header and every field of the input, bit for bit; a finite point
-    is in exactly one of the two clouds, any other in neither. The first clouds are segmented
+    Each output keeps the header and every field of the input, bit for bit; a return is in
+    exactly one of the two clouds, a point that is none in neither. The first clouds are segmented
     with numpy; the compiled backend, if wanted, is made meanwhile. A changed parameter takes
     effect with the next cloud. Where the height of the sensor is estimated, a cloud that does
     not show the ground well has the pose of the last one that did. Options are those of
@@ -223,8 +223,11 @@ class GroundSegmentationNode(ConfiguredNode):
         clock = self.get_clock()
         source, now = self._input, 1e-9 * clock.now().nanoseconds
         is_simulated = clock.ros_time_is_active
+        if no_time := clock_fault(clock):
+            self.get_logger().warning(no_time, once=True)
+        faults = '; '.join(filter(None, (source.fault, no_time)))
         facts = InputFacts(
-            source.topic, source.qos_words, source.n_publishers, now, is_simulated, source.fault,
+            source.topic, source.qos_words, source.n_publishers, now, is_simulated, faults,
             source.idle,
         )  # fmt: skip
         return facts, self._outputs.n_subscribers()
@@ -261,6 +264,8 @@ def main(
             with start_stop.large_cloud_transport():
                 start_stop.initialize(words)
                 node = make_node(stop)
+            for line in start_stop.unused_files(words, node.get_fully_qualified_name()):
+                node.get_logger().warning(line)
             _spin(node, stop)
         except GroundSegError as error:
             problem = start_stop.with_file(str(error), words)

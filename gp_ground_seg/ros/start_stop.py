@@ -28,11 +28,14 @@ from gp_ground_seg.core.errors import (
     MissingDependencyError,
     install_hint,
     reason_of,
+    shown,
 )
 from gp_ground_seg.core.parameters.export import file_problems
 from gp_ground_seg.core.parameters.schema import ROS_PARAMETERS_KEY, read_yaml
 
 HIGHEST_DOMAIN = 232
+EVERY_NODE = '/**'
+_MOST_KEYS = 10  # of a parameter file that are listed
 LOG_FOLDER = 'set ROS_LOG_DIR to a folder that the node may write to'
 ROS_WHEELS = "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
 
@@ -95,7 +98,7 @@ def _check_surroundings(words: Sequence[str]) -> None:
             raise ConfigError(f'{path}: {reason_of(error)}') from error
         except (UnicodeDecodeError, ConfigError) as error:
             raise ConfigError(f'{path}: {error}') from error
-        if document and not _is_of_ros(document):
+        if document and not _node_keys(document):
             hint = 'gp-ground-seg config dump writes a file of the form of ROS'
             if not file_problems(path):
                 hint = (
@@ -117,11 +120,33 @@ def with_file(problem: str, words: Sequence[str]) -> str:
     return problem
 
 
-def _is_of_ros(document: object) -> bool:
-    """Whether parameters of a node are anywhere below, as below nested namespaces."""
+def unused_files(words: Sequence[str], node_name: str) -> list[str]:
+    """Return a line for each parameter file in which no key is that of the node `node_name`."""
+    lines = []
+    for path in _parameter_files(words):
+        keys: list[str] = []
+        with contextlib.suppress(OSError, ConfigError):  # it was read before, and may be gone
+            keys = _node_keys(read_yaml(path))
+        # The two that rclpy knows: to it, /* and /**/name are names.
+        if keys and not {node_name, EVERY_NODE} & {f'/{key.lstrip("/")}' for key in keys}:
+            more = [f'{len(keys) - _MOST_KEYS} more'] if len(keys) > _MOST_KEYS else []
+            lines.append(
+                f'{shown(path)}: not used: its parameters are those of '
+                f'{", ".join([*map(shown, keys[:_MOST_KEYS]), *more])}, and this node is '
+                f'{node_name}; {EVERY_NODE} is every node'
+            )
+    return lines
+
+
+def _node_keys(document: object, above: str = '') -> list[str]:
+    """Return the names, with nested namespaces, whose parameters a document has."""
     if not isinstance(document, dict):
-        return False
-    return ROS_PARAMETERS_KEY in document or any(map(_is_of_ros, document.values()))
+        return []
+    found = [above] if ROS_PARAMETERS_KEY in document else []
+    for key, below in document.items():
+        if key != ROS_PARAMETERS_KEY:
+            found += _node_keys(below, f'{above}/{key}' if above else str(key))
+    return found
 
 
 @contextmanager

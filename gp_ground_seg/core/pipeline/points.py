@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.frame import BoolArray, FloatArray, PointArray
+from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, PointArray
 
-Direction = tuple[float, float, float]
+Direction = Place = tuple[float, float, float]
 
 COMPUTED = (np.dtype(np.float32), np.dtype(np.float64))
 """Types that are computed with."""
@@ -23,17 +23,23 @@ LARGEST = {4: 1e38, 8: 1e300}
 """By bytes: coordinates beyond this are taken to be this [m]: sums of three still are numbers."""
 _MAX_BEYOND = 0.1  # share of the points that may lie there, as wrong returns
 _N_JUDGED = 1000  # points looked at in a larger cloud
+_MANY, _MANY_SHARE = 1000, 0.03  # points, and share of all, that repeat one place: no returns do
+_FARTHEST_MOUNT = 5.0  # distance of such a place from the origin of a vehicle's cloud [m]
+_N_ALIKE = 10  # points of a sample of `_N_JUDGED` that show such a place
+# Places of a sample along the points, of 1, that no number of rings or columns is a multiple of.
+_SAMPLE = np.arange(_N_JUDGED) * ((math.sqrt(5.0) - 1.0) / 2.0) % 1.0
 _MOST_ROWS, _LEAST_COLUMNS = 8, 65  # of an array that is taken for a transposed one
 _Float = TypeVar('_Float', np.float32, np.float64)
 
 
-def take_points(points: npt.ArrayLike) -> PointArray:
+def take_points(points: npt.ArrayLike, origin: Place | None = None) -> PointArray:
     """Return x, y, z, as they lie in memory if their type is one that is computed with.
 
     Of `points` (N, >=3) columns after the third are ignored. The result (N, 3) shares memory with
-    them, if it can; it is of single precision for types of up to four bytes. Raises a
-    PointCloudError if the shape or type is another, the array is masked or transposed, or the
-    points are farther away than `FARTHEST`.
+    them, if it can; it is of single precision for types of up to four bytes. With the `origin` of
+    the sensor [m] points that are no returns become NaN, in a copy: see `without_empty_rays`.
+    Raises a PointCloudError if the shape or type is another, the array is masked or transposed,
+    or the points are farther away than `FARTHEST`.
     """
     if isinstance(points, np.ma.MaskedArray):
         raise PointCloudError('points are a masked array: pass points.filled(numpy.nan)')
@@ -52,12 +58,57 @@ def take_points(points: npt.ArrayLike) -> PointArray:
         )
     if problem := objection_to_ranges(array[:: 1 + len(array) // _N_JUDGED, :3]):
         raise PointCloudError(problem)
-    if array.dtype in COMPUTED and array.flags.aligned:
-        return array[:, :3]
-    dtype = np.dtype(np.float32 if array.dtype.itemsize <= 4 else np.float64)
+    xyz = array[:, :3]
     # Bytes from a sensor may be a signalling NaN, one more value that is not finite.
-    with np.errstate(invalid='ignore'):
-        return array[:, :3].astype(dtype, copy=not array.flags.aligned)
+    with np.errstate(invalid='ignore', over='ignore'):
+        if array.dtype not in COMPUTED or not array.flags.aligned:
+            dtype = np.dtype(np.float32 if array.dtype.itemsize <= 4 else np.float64)
+            xyz = xyz.astype(dtype, copy=not array.flags.aligned)
+        return xyz if origin is None else without_empty_rays(xyz, origin, array.dtype)
+
+
+def without_empty_rays(xyz: PointArray, origin: Place, written: np.dtype[Any]) -> PointArray:
+    """Return points (N, 3) with NaN in place of those at the sensor, or `xyz` if there are none.
+
+    Drivers send rays without a return as (0, 0, 0), which a change of frame moves to the `origin`
+    of the sensor [m]. It is compared as rounded to the type `written`, or to single precision if
+    that has more digits: coordinates mostly were of single precision once. Where nobody has given
+    the origin, it is a place that many points share; so are those of several sensors.
+    """
+    rounding = float(max(np.finfo(written).eps, np.finfo(np.float32).eps))
+    x = np.ascontiguousarray(xyz[:, 0])
+    empty = [_points_at(place, x, xyz, rounding) for place in {(0.0, 0.0, 0.0), origin}]
+    for place in _shared_places(x, xyz):
+        alike = _points_at(place, x, xyz, 0.0)
+        empty += [alike] if len(alike) >= max(_MANY, _MANY_SHARE * len(xyz)) else []
+    if not any(map(len, empty)):
+        return xyz
+    xyz = np.array(xyz, order='F')
+    xyz[np.concatenate(empty)] = np.nan
+    return xyz
+
+
+def _points_at(place: Place, x: PointArray, xyz: PointArray, rounding: float) -> IntArray:
+    """Return the points (N, 3), with their `x` (N,), that are at `place` but for `rounding`."""
+    tolerance = rounding * max(map(abs, place))
+    # Few points have this x, and only those are looked at further.
+    near = np.flatnonzero(np.abs(x - place[0]) <= tolerance if tolerance else x == place[0])
+    for axis in (1, 2):
+        near = near[np.abs(xyz[near, axis] - place[axis]) <= tolerance]
+    return near
+
+
+def _shared_places(x: PointArray, xyz: PointArray) -> list[Place]:
+    """Return where sensors may be: what several of the points (N, 3), with their `x` (N,), are."""
+    if len(x) < _MANY:
+        return []
+    sample = (_SAMPLE * len(x)).astype(np.int64)
+    ordered = np.sort(x[sample])
+    if not (ordered[_N_ALIKE - 1 :] == ordered[: 1 - _N_ALIKE]).any():
+        return []
+    rows, number = np.unique(xyz[sample], axis=0, return_counts=True)
+    places = [(a, b, c) for a, b, c in rows[number >= _N_ALIKE].tolist()]
+    return [place for place in places if math.hypot(*place) <= _FARTHEST_MOUNT]
 
 
 @np.errstate(all='ignore')
