@@ -3,6 +3,7 @@
 import contextlib
 import importlib.util
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -113,6 +114,39 @@ def test_without_the_message_the_node_says_what_to_set(tmp_path):
         change(link, Transition.TRANSITION_CONFIGURE)
         change(link, Transition.TRANSITION_ACTIVATE)
         process.wait_until_ready('set bond_timeout: 0.0')
+
+
+def test_impossible_transitions_are_refused_at_once(tmp_path):
+    configure, activate = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE
+    possible = {
+        State.PRIMARY_STATE_UNCONFIGURED: configure,
+        State.PRIMARY_STATE_INACTIVE: activate,
+        State.PRIMARY_STATE_ACTIVE: Transition.TRANSITION_DEACTIVATE,
+    }
+    leading = {1: {1, 5}, 2: {2, 3, 6}, 3: {4, 7}, 4: set()}  # ids that do something in a state
+    with managed_node(tmp_path, NUMBA_DISABLE_JIT='1') as (process, link):
+        for state in (*possible, State.PRIMARY_STATE_FINALIZED):
+            for number in {*range(12), *range(60, 70), 99, 255} - leading[state]:
+                start = time.monotonic()
+                assert change(link, number) == (False, state), (state, number)
+                assert time.monotonic() - start < 5.0
+            for label in ('create', 'activate', 'nonsense\n'):
+                if (state, label) != (State.PRIMARY_STATE_INACTIVE, 'activate'):
+                    request = ChangeState.Request(transition=Transition(label=label))
+                    assert not link.call(ChangeState, 'change_state', request).success
+            if state == State.PRIMARY_STATE_ACTIVE:
+                assert sum(cloud.width for cloud in link.segment(to_message(street(500)))) == 500
+                shutdown = change(link, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+                assert shutdown == (True, State.PRIMARY_STATE_FINALIZED)
+            elif state in possible:
+                assert change(link, possible[state])[0]
+                if state == State.PRIMARY_STATE_INACTIVE:
+                    link.wait_until_connected()
+        refused = [line for line in process.log.splitlines() if ' refused: the node is ' in line]
+        assert refused and '[WARN]' in refused[0]
+        assert 'unconfigured, where there are 1 (configure), 5 (shutdown)' in refused[0]
+        assert process.stop(signal.SIGINT)[0] == 0
+        assert 'Traceback' not in process.log and 'ERROR' not in process.log
 
 
 @pytest.mark.slow

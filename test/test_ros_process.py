@@ -14,6 +14,7 @@ pytest.importorskip('rclpy', reason='ROS is not installed')
 
 import ros_helpers as ros
 from conftest import REPOSITORY
+from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import ParameterType
 from nav_msgs.msg import OccupancyGrid
 from ros_helpers import NAMESPACE, street, to_message
@@ -129,6 +130,25 @@ def test_what_rclpy_raises_does_not_end_the_node(node):
         ros.wait_for(lambda: publisher.publish(clock) or 'negative' in node.log, 'message')
         link.segment(to_message(street(500)))
         assert link.set('use_sim_time', False).successful
+
+
+def test_simulated_time_without_a_clock_is_said(tmp_path):
+    words = ros.given({'diagnostics.period': 0.2, 'use_sim_time': True, 'runtime.backend': 'numpy'})
+    with ros.linked_process(tmp_path, *words) as (node, link):
+        link.segment(to_message(street(500)))
+        status = link.wait_for_status('input', lambda v, _: v['Events since startup'] == '1')
+        assert status.level == DiagnosticStatus.WARN and status.message == NO_TIME
+        link.diagnostics.wait(8)
+        (line,) = [line for line in node.log.splitlines() if NO_TIME in line]
+        assert '[WARN]' in line
+        publisher, clock = link.probe.create_publisher(Clock, '/clock', 1), Clock()
+        clock.clock.sec = 5
+        clock_runs = lambda: any(  # noqa: E731
+            NO_TIME not in status.message
+            for status in link.diagnostics.messages[-1].status
+            if status.name.endswith(': input')
+        )
+        ros.wait_for(lambda: publisher.publish(clock) or clock_runs(), 'time')
 
 
 # Sends best-effort clouds of 1.9 MB until it is ended; its domain is that of the environment.

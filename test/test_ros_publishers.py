@@ -1,5 +1,7 @@
 """Publishers on the input: reliable, best-effort, both, changing; their losses are counted."""
 
+import contextlib
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,7 +11,7 @@ pytest.importorskip('rclpy', reason='ROS is not installed')
 import ros_helpers as ros
 from diagnostic_msgs.msg import DiagnosticStatus
 from ros_helpers import BEST_EFFORT, NAMESPACE, RELIABLE, street, to_message, wait_for
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import Image, LaserScan, PointCloud2
 
 from gp_ground_seg.ros.input import SequenceGaps
 
@@ -133,6 +135,45 @@ def test_large_clouds_that_come_best_effort_are_a_warning(node, link):
     assert 'FASTRTPS_DEFAULT_PROFILES_FILE' in status.message
     (line,) = [line for line in node.log.splitlines() if 'come best-effort' in line]
     assert '[WARN]' in line and f'{NAMESPACE}/points' in line
+
+
+@contextlib.contextmanager
+def driver_of(message_type):
+    """A publisher of best-effort messages of that type, on the topic of the clouds."""
+    with ros.isolated_context() as context:
+        driver = ros.Node('driver', context=context, namespace=NAMESPACE)
+        driver.create_publisher(message_type, 'points', BEST_EFFORT)
+        with ros.spinning(context, driver):
+            yield
+
+
+def test_messages_of_another_type_are_named(node, link):
+    wanted = 'sensor_msgs/msg/LaserScan is sent there, and sensor_msgs/msg/PointCloud2 is wanted'
+    with driver_of(LaserScan):
+        status = link.wait_for_status('input', lambda _, s: wanted in s.message)
+        assert status.level == DiagnosticStatus.WARN
+        assert ros.values_of(status)['Publishers'] == '0'
+        # Clouds beside it still come.
+        send_and_wait(link, SMALL, add_publisher(link, RELIABLE, 'reliable'))
+    link.wait_for_status('input', lambda _, s: wanted not in s.message)
+    (line,) = [line for line in node.log.splitlines() if wanted in line]
+    assert '[WARN]' in line and f'on {NAMESPACE}/points' in line
+
+
+def test_another_type_alone_is_the_reason_of_silence(tmp_path):
+    often = ros.given({**CHANGES, 'diagnostics.stale_after': 0.5})
+    with (
+        driver_of(Image),
+        ros.linked_process(tmp_path, *often, sends=None) as (process, link),
+    ):
+        wanted = 'sensor_msgs/msg/Image is sent there, and sensor_msgs/msg/PointCloud2 is wanted'
+        status = link.wait_for_status(
+            'input', lambda _, s: s.level == DiagnosticStatus.STALE and wanted in s.message
+        )
+        assert f'no cloud on {NAMESPACE}/points for' in status.message
+        assert wanted in process.log
+        # It follows the publishers of clouds only.
+        assert 'reliable, keep_last 5' in ros.values_of(status)['QoS']
 
 
 @given(st.lists(st.booleans(), min_size=1))

@@ -17,7 +17,7 @@ from cli_runner import children, is_running, stat_words
 from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 
 from gp_ground_seg.core.jit import HAVE_NUMBA
-from gp_ground_seg.ros.start_stop import ROS_WHEELS, ros_session, stop_on_signals
+from gp_ground_seg.ros.start_stop import ROS_WHEELS, ros_session, stop_on_signals, unused_files
 
 FIXED = (*IN_NAMESPACE, '-p', 'learning.mode:=fixed')
 SOON = 4.0
@@ -139,6 +139,63 @@ def test_two_nodes_read_their_parts_of_one_file(tmp_path, name, tolerance):
         assert node.config.label.ground_tolerance == tolerance
         assert node.config.learning.mode == 'fixed'
         assert node.resolve_topic_name('points') == f'{NAMESPACE}/{name}/points'
+
+
+NAME = f'{NAMESPACE}/front/filter'
+KEYS = {
+    '/**:\n  P': True,
+    '"**":\n  P': True,
+    f'{NAME}:\n  P': True,
+    f'{NAME[1:]}:\n  P': True,
+    f'{NAMESPACE}:\n  front:\n    filter:\n      P': True,
+    f'{NAMESPACE}/front:\n  filter:\n    P': True,
+    'patchworkpp_node:\n  P': False,
+    'ground_segmentation_node:\n  P': False,  # it has another name
+    'filter:\n  P': False,  # and is in a namespace
+    f'{NAMESPACE}/filter:\n  P': False,
+    f'{NAMESPACE}/front:\n  other:\n    P': False,
+    '/**/filter:\n  P': True,
+    '/**:\n  filter:\n    P': True,
+    '/**/front:\n  P': False,
+    '/*/*/filter:\n  P': True,
+    '/*/front:\n  filter:\n    P': True,
+    f'{NAMESPACE}/*:\n  P': False,
+    f'{NAMESPACE}/**:\n  P': True,
+    '/*/*/*:\n  P': True,
+    '"*/filter":\n  P': False,
+    '/*:\n  P': False,
+    f'{NAME}/**:\n  P': True,
+    f'other:\n  P\n{NAME}:\n  P': True,
+}
+
+
+@pytest.mark.parametrize('text', KEYS)
+def test_a_file_is_unused_where_rcl_takes_nothing_of_it(tmp_path, text):
+    path = tmp_path / 'keys.yaml'
+    path.write_text(text.replace('P', 'ros__parameters: {label: {ground_tolerance: 0.3}}'))
+    words = '-r', f'__ns:={NAMESPACE}/front', '-r', '__node:=filter', '--params-file', str(path)
+    with ros.started_node(*words) as node:
+        assert (node.config.label.ground_tolerance == 0.3) == KEYS[text]
+        assert len(unused_files(words, node.get_fully_qualified_name())) == (not KEYS[text])
+
+
+def test_unused_files_are_warned_of_with_their_keys(tmp_path):
+    words = []
+    for name, keys in (('a\x1b[2J', ['b', '/c/d']), ('used', ['/**']), ('many', range(13))):
+        path = tmp_path / f'{name}.yaml'
+        path.write_text(''.join(f'{key}:\n  ros__parameters: {{}}\n' for key in keys))
+        words += ['--params-file', str(path)]
+    first, last = unused_files([*words, '--params-file', 'gone.yaml'], '/front/filter')
+    assert first.startswith(rf'{tmp_path}/a\x1b[2J.yaml: not used: ')
+    assert 'those of b, /c/d, and this node is /front/filter' in first
+    assert 'those of 0, 1, ' in last and '9, 3 more, and' in last
+    (tmp_path / 'a.yaml').write_text('patchworkpp_node:\n  ros__parameters: {sensor.height: 0.5}\n')
+    words = *FIXED, '-p', 'runtime.backend:=numpy', '--params-file', str(tmp_path / 'a.yaml')
+    with Process(*words, folder=tmp_path) as node:
+        node.wait_until_ready('not used')
+        (line,) = [line for line in node.log.splitlines() if 'WARN' in line]
+        for text in ('a.yaml', 'patchworkpp_node', f'{NAMESPACE}/ground_segmentation_node'):
+            assert text in line
 
 
 @pytest.mark.slow

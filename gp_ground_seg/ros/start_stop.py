@@ -34,7 +34,6 @@ from gp_ground_seg.core.parameters.export import file_problems
 from gp_ground_seg.core.parameters.schema import ROS_PARAMETERS_KEY, read_yaml
 
 HIGHEST_DOMAIN = 232
-EVERY_NODE = '/**'
 _MOST_KEYS = 10  # of a parameter file that are listed
 LOG_FOLDER = 'set ROS_LOG_DIR to a folder that the node may write to'
 ROS_WHEELS = "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
@@ -127,15 +126,21 @@ def unused_files(words: Sequence[str], node_name: str) -> list[str]:
         keys: list[str] = []
         with contextlib.suppress(OSError, ConfigError):  # it was read before, and may be gone
             keys = _node_keys(read_yaml(path))
-        # The two that rclpy knows: to it, /* and /**/name are names.
-        if keys and not {node_name, EVERY_NODE} & {f'/{key.lstrip("/")}' for key in keys}:
+        if keys and not any(_is_of_node(key, node_name) for key in keys):
             more = [f'{len(keys) - _MOST_KEYS} more'] if len(keys) > _MOST_KEYS else []
             lines.append(
                 f'{shown(path)}: not used: its parameters are those of '
-                f'{", ".join([*map(shown, keys[:_MOST_KEYS]), *more])}, and this node is '
-                f'{node_name}; {EVERY_NODE} is every node'
+                f'{", ".join([*keys[:_MOST_KEYS], *more])}, and this node is '
+                f'{node_name}; a key of /** is for every node'
             )
     return lines
+
+
+def _is_of_node(key: str, node_name: str) -> bool:
+    """Whether rclpy gives the parameters of `key` to a node: ``*`` is any word, ``**`` several."""
+    rooted = key if key.startswith('/') else f'/{key}'
+    # rcl has accepted the key: there are letters, digits and _ beside them.
+    return re.fullmatch(rooted.replace('/*', r'(/\w+)'), node_name) is not None
 
 
 def _node_keys(document: object, above: str = '') -> list[str]:
