@@ -79,7 +79,9 @@ def test_places_that_many_points_share_are_sensors():
     for n_rings, share in ((64, 0.04), (40, 0.04), (1, 0.9), (1, 0.01)):
         scan = rng.uniform(-20.0, 20.0, (40_000, 3)).astype('f4').round(2)
         spot = rng.integers(3, size=40_000)
-        shared = rng.random(40_000) < 3.0 * share if n_rings == 1 else np.arange(40_000) % n_rings < 8
+        shared = (
+            rng.random(40_000) < 3.0 * share if n_rings == 1 else np.arange(40_000) % n_rings < 8
+        )
         scan[shared] = places[spot[shared]]
         empty = np.isnan(points.take_points(scan, (0.0, 0.0, 0.0))[:, 0])
         # Not those that few points share, nor those that are farther away than a sensor.

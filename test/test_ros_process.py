@@ -15,8 +15,8 @@ pytest.importorskip('rclpy', reason='ROS is not installed')
 import ros_helpers as ros
 from conftest import REPOSITORY
 from diagnostic_msgs.msg import DiagnosticStatus
-from rcl_interfaces.msg import ParameterType
 from nav_msgs.msg import OccupancyGrid
+from rcl_interfaces.msg import ParameterType
 from ros_helpers import NAMESPACE, street, to_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan, PointCloud2
@@ -133,7 +133,9 @@ def test_what_rclpy_raises_does_not_end_the_node(node):
 
 
 def test_simulated_time_without_a_clock_is_said(tmp_path):
-    words = ros.given({'diagnostics.period': 0.2, 'use_sim_time': True, 'runtime.backend': 'numpy'})
+    words = ros.given(
+        {'diagnostics.period': 0.2, 'use_sim_time': True, 'runtime.backend': 'numpy'}
+    )
     with ros.linked_process(tmp_path, *words) as (node, link):
         link.segment(to_message(street(500)))
         status = link.wait_for_status('input', lambda v, _: v['Events since startup'] == '1')

@@ -189,7 +189,9 @@ def test_unused_files_are_warned_of_with_their_keys(tmp_path):
     assert first.startswith(rf'{tmp_path}/a\x1b[2J.yaml: not used: ')
     assert 'those of b, /c/d, and this node is /front/filter' in first
     assert 'those of 0, 1, ' in last and '9, 3 more, and' in last
-    (tmp_path / 'a.yaml').write_text('patchworkpp_node:\n  ros__parameters: {sensor.height: 0.5}\n')
+    (tmp_path / 'a.yaml').write_text(
+        'patchworkpp_node:\n  ros__parameters: {sensor.height: 0.5}\n'
+    )
     words = *FIXED, '-p', 'runtime.backend:=numpy', '--params-file', str(tmp_path / 'a.yaml')
     with Process(*words, folder=tmp_path) as node:
         node.wait_until_ready('not used')

@@ -136,7 +136,11 @@ class InputTask:
         if facts.idle:
             return Level.OK, f'not listening to {facts.topic}: {facts.idle}'
         if silence > stale_after:
-            source = f'publishers: {facts.n_publishers}' if facts.n_publishers else 'nobody sends'
+            source = (
+                f'publishers: {facts.n_publishers}'
+                if facts.n_publishers
+                else 'nobody sends clouds'
+            )
             why = f'; {facts.fault}' if facts.fault else ''
             return Level.STALE, f'no cloud on {facts.topic} for {silence:.1f} s ({source}){why}'
         # A stamp may be of any age: a recording is played at any time.

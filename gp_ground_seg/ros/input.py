@@ -29,8 +29,8 @@ NOTHING_ARRIVES = (
     'qos_overrides asks for reliable, and a publisher offers best effort: nothing arrives from it'
 )
 NO_TIME = (
-    'use_sim_time is true, and no time has come on /clock: start what publishes it, as play '
-    '--clock, or set use_sim_time to false'
+    'use_sim_time is true, and no time has come on /clock: start what publishes it, or set '
+    'use_sim_time to false'
 )
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)  # the clock of a node may stand or jump
 THROTTLED = {'throttle_duration_sec': 5.0, 'throttle_time_source_type': STEADY_CLOCK}
