@@ -1,5 +1,6 @@
 """Compiled code on disk: used again, never when damaged, planted or out of date."""
 
+import fcntl
 import hashlib
 import json
 import os
@@ -31,7 +32,7 @@ def half(x):
     return 0.5 * x
 """
 RUN = """
-import json, logging, os, sys
+import json, logging, os, pathlib, sys, time
 logging.basicConfig(level=logging.INFO, stream=sys.stderr, format='%(message)s')
 import small
 if 'IDLE' not in os.environ:
@@ -39,6 +40,10 @@ if 'IDLE' not in os.environ:
 result = None if 'IDLE' in os.environ else small.double(21.0)
 hits, misses = (sum(c.values()) for c in small.double.stats[1:]) if small.JIT_ENABLED else (0, 0)
 was_kept = small.is_code_kept()
+if 'WAIT' in os.environ:
+    pathlib.Path('compiled').touch()
+    while not pathlib.Path('go').exists():
+        time.sleep(0.01)
 if 'COLD' not in os.environ:
     small.half(1.0)
 small.keep_code()
@@ -55,17 +60,22 @@ class Program:
         (folder / 'small.py').write_text(MODULE)
         self.stderr = ''
 
-    def run(self, **environment: str) -> list:
+    def run(self, limit=None, **environment: str) -> list:
+        """What a run says; it writes at most `limit` bytes to a file, as to a full disk."""
+        process = self.start(limit, **environment)
+        said, self.stderr = process.communicate(timeout=120)
+        assert process.returncode == 0, self.stderr
+        return json.loads(said)
+
+    def start(self, limit=None, **environment: str) -> subprocess.Popen:
         changed = {'NUMBA_CACHE_DIR': str(self.cache), **environment}
         kept = {k: v for k, v in os.environ.items() if not k.startswith(('NUMBA_', 'XDG_'))}
-        done = subprocess.run(
-            [sys.executable, '-c', RUN],
+        size = '' if limit is None else f'ulimit -f {limit // 1024}; '
+        return subprocess.Popen(
+            ['bash', '-c', size + 'exec "$@"', '-', sys.executable, '-c', RUN],
             env=kept | {k: v for k, v in changed.items() if v is not None},
-            cwd=self.folder, capture_output=True, text=True, timeout=120,
+            cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        self.stderr = done.stderr
-        return json.loads(done.stdout)
 
     @property
     def entries(self) -> list[Path]:
@@ -174,6 +184,63 @@ def test_damaged_code_is_compiled_again(program, names):
         assert program.run()[:4] == COMPILED, name
     assert program.run()[:4] == LOADED
     assert not (program.folder / 'ran').exists()
+
+
+@pytest.mark.parametrize('limit', [0, 1024])
+def test_a_full_disk_ends_nothing(program, limit):
+    """With the larger one numba writes its index, and no code."""
+    *result, _ = program.run(limit, PYTHONDONTWRITEBYTECODE='1')
+    assert result == COMPILED
+    (line,) = [line for line in program.stderr.splitlines() if 'not kept on disk' in line]
+    assert 'File too large' in line
+    assert 'Traceback' not in program.stderr
+    assert program.run()[:4] == COMPILED
+    assert program.run()[:4] == LOADED
+    # And it does not matter where all is there.
+    assert program.run(limit)[:4] == LOADED and program.stderr == ''
+
+
+def test_a_process_that_starts_leaves_what_another_compiles(program):
+    with program.start(WAIT='1') as first:
+        while not (program.folder / 'compiled').exists():
+            assert first.poll() is None
+        before = {path: path.stat().st_ino for path in program.entries}
+        assert before and not list(program.cache.rglob('kept.json'))
+        assert program.run(COLD='1')[:3] == LOADED[:3]
+        assert {path: path.stat().st_ino for path in program.entries} == before
+        (program.folder / 'go').touch()
+        first.communicate()
+    assert program.run()[:4] == LOADED
+
+
+def test_what_several_find_damaged_is_kept_again(program):
+    program.run()
+    for name in ('zeros in the code', 'planted index'):
+        DAMAGES[name](program)
+        processes = [program.start() for _ in range(4)]
+        for process in processes:
+            said, errors = process.communicate(timeout=120)
+            assert json.loads(said)[0] == 42.0 and 'not kept' not in errors
+        assert program.run()[:4] == LOADED
+
+
+def test_code_of_earlier_sources_goes_when_later_is_kept(program):
+    ours = program.cache / 'gp_ground_seg'
+    ours.mkdir(parents=True, mode=0o700)
+    sources = {
+        'earlier': jit_module._CORE, 'used': jit_module._CORE, 'gone': '/no/such/sources',
+        'other': program.folder, 'unknown': '',
+    }  # fmt: skip
+    for name, place in sources.items():
+        (ours / name).mkdir()
+        (ours / name / 'lock').write_text(str(place))
+    with (ours / 'used' / 'lock').open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_SH)
+        program.run(COLD='1')
+        assert len(list(ours.iterdir())) == 6
+        *_, folder = program.run()
+    left = {path.name for path in ours.iterdir()}
+    assert left == {'used', 'other', 'unknown', Path(folder).name}
 
 
 @pytest.mark.parametrize(

@@ -2,17 +2,21 @@
 
 numba keeps compiled code itself (``cache=True``), here in a folder of the user whose name is a
 digest of our sources and of versions: code of other sources is never read. An entry that does not
-fit its checksum, as after a power cut, is compiled again.
+fit its checksum, as after a power cut, is compiled again. Processes that use a folder hold a lock
+on it: what another one has just compiled is not yet noted, and must not be taken for damaged.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import functools
 import hashlib
 import importlib.util
 import json
 import logging
 import os
+import shutil
 import stat
 import sys
 from collections.abc import Callable
@@ -33,8 +37,8 @@ _Function = TypeVar('_Function', bound=Callable[..., Any])
 _CORE = Path(__file__).parent
 _entry_points: list[Any] = []
 _shared: list[Callable[..., Any]] = []
-_KEPT = 'kept.json'
-_is_warm = _is_missing = False
+_KEPT, _LOCK = 'kept.json', 'lock'
+_is_warm = _is_missing = _is_not_kept = False
 _n_ready = _n_kept = 0
 
 
@@ -155,13 +159,32 @@ def _njit_kept(function: Callable[..., Any], options: dict[str, Any]) -> Any:
         finally:
             numba.config.CACHE_DIR = before
         if folder in Path(kept.stats.cache_path).parents:
+            for name in ('load_overload', 'save_overload'):
+                setattr(kept._cache, name, _or_nothing(getattr(kept._cache, name)))
             return kept
         _log_not_kept(f'{folder} cannot be written to')
     return numba.njit(**options)(function)
 
 
-@functools.cache
+def _or_nothing(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `method` of numba's cache, without the errors of a disk that is full or damaged."""
+
+    def attempt(*arguments: Any) -> Any:
+        try:
+            return method(*arguments)
+        except OSError as error:
+            _log_not_kept(str(error))
+            return None
+
+    return attempt
+
+
 def _log_not_kept(reason: str) -> None:
+    """Log once that code is compiled at every start."""
+    global _is_not_kept
+    if _is_not_kept:
+        return
+    _is_not_kept = True
     _LOGGER.warning(
         'compiled code is not kept on disk (%s): every start compiles, which takes 20 to 60 s; '
         'set NUMBA_CACHE_DIR to a folder of your own',
@@ -185,7 +208,11 @@ def code_folder() -> Path | None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder = folder.resolve()
         _require_private(folder)
-        _delete_damaged(folder)
+        lock, is_alone = _lock(folder)
+        try:
+            _delete_damaged(folder, is_alone)
+        finally:
+            fcntl.flock(lock, fcntl.LOCK_SH)
     except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home
         _log_not_kept(str(error))
         return None
@@ -205,6 +232,34 @@ def _require_private(folder: Path) -> None:
             raise PermissionError(f'others can write to {path}')
 
 
+def _lock(folder: Path) -> tuple[int, bool]:
+    """Lock `folder` until the process ends, and say whether no other uses it.
+
+    The file has the place of our sources, by which `_delete_old` knows code of earlier ones.
+    """
+    lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        fcntl.flock(lock, fcntl.LOCK_SH)  # once the other has looked at the files
+        return lock, False
+    if os.fstat(lock).st_size == 0:
+        with contextlib.suppress(OSError):  # the disk is full
+            os.write(lock, os.fsencode(_CORE))
+    return lock, True
+
+
+def _delete_old(folder: Path) -> None:
+    """Delete code beside `folder` of other sources in our place, or in one that is gone."""
+    for path in folder.parent.glob(f'*/{_LOCK}'):
+        sources = os.fsdecode(path.read_bytes())
+        if path.parent == folder or not (sources == str(_CORE) or not Path(sources).exists()):
+            continue
+        with path.open('rb') as lock, contextlib.suppress(BlockingIOError):
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(path.parent, ignore_errors=True)
+
+
 def _digest() -> str:
     """Name of what the code was compiled from: sources, where they lie, and versions."""
     versions = [sys.version, np.__version__, *map(metadata.version, ('numba', 'llvmlite'))]
@@ -216,10 +271,12 @@ def _digest() -> str:
 
 def _checksums(folder: Path) -> dict[str, str]:
     """SHA-256 of each file in which numba keeps code, by its path in `folder`."""
-    return {
-        entry.relative_to(folder).as_posix(): hashlib.sha256(entry.read_bytes()).hexdigest()
-        for entry in folder.rglob('*.nb[ic]')
-    }
+    found = {}
+    for entry in folder.rglob('*.nb[ic]'):
+        with contextlib.suppress(FileNotFoundError):  # another process has just deleted it
+            name = entry.relative_to(folder).as_posix()
+            found[name] = hashlib.sha256(entry.read_bytes()).hexdigest()
+    return found
 
 
 def _read_kept(folder: Path) -> dict[str, Any]:
@@ -231,13 +288,31 @@ def _read_kept(folder: Path) -> dict[str, Any]:
     return kept if isinstance(kept, dict) else {}
 
 
-def _delete_damaged(folder: Path) -> None:
-    """Delete the files that do not fit their checksum; numba compiles again what they held."""
+def _write_kept(folder: Path, kept: dict[str, Any]) -> None:
+    """Note what `_read_kept` returns."""
+    unfinished = folder / f'{_KEPT}.{os.getpid()}'
+    unfinished.write_text(json.dumps(kept))
+    os.replace(unfinished, folder / _KEPT)
+
+
+def _delete_damaged(folder: Path, is_alone: bool) -> None:
+    """Delete the files that do not fit their checksum; numba compiles again what they held.
+
+    Unless we are alone, one without a checksum may be of a process that compiles.
+    """
     global _is_warm, _is_missing
     kept, found = _read_kept(folder), _checksums(folder)
-    damaged = [name for name, checksum in found.items() if kept.get(name) != checksum]
+    damaged = [
+        name
+        for name, checksum in found.items()
+        if kept.get(name) != checksum and (is_alone or name in kept)
+    ]
     for name in damaged:
-        (folder / name).unlink()
+        (folder / name).unlink(missing_ok=True)
+    if is_alone and kept.keys() & damaged:
+        # What takes their place has no checksum yet, rather than a wrong one.
+        left = {name: checksum for name, checksum in kept.items() if name not in damaged}
+        _write_kept(folder, {**left, 'warm': False})
     is_whole = bool(kept) and not damaged and found.keys() >= kept.keys() - {'warm'}
     _is_warm, _is_missing = is_whole and kept.get('warm') is True, not is_whole
 
@@ -252,14 +327,17 @@ def keep_code() -> None:
     _n_ready = n_ready
     # Of those the ones that were compiled, not loaded; slow to count.
     n_compiled = sum(len(entry.stats.cache_misses) for entry in _entry_points)
-    warm = _is_whole()
+    warm = _is_whole() and not _is_not_kept
     if n_compiled == _n_kept and (_is_warm or not warm):
         return
     _n_kept, _is_warm = n_compiled, _is_warm or warm
-    unfinished = folder / f'{_KEPT}.{os.getpid()}'
     try:
-        unfinished.write_text(json.dumps({**_checksums(folder), 'warm': _is_warm}))
-        os.replace(unfinished, folder / _KEPT)
+        found = _checksums(folder)
+        # Fewer files than functions: another process has deleted some as damaged.
+        _is_warm = _is_warm and sum(name.endswith('.nbc') for name in found) >= len(_entry_points)
+        _write_kept(folder, {**found, 'warm': _is_warm})
+        if _is_warm:
+            _delete_old(folder)
     except OSError as error:
         _log_not_kept(str(error))
 
