@@ -11,7 +11,8 @@ import numpy.typing as npt
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, PointArray
 
-Direction = Place = tuple[float, float, float]
+Direction = tuple[float, float, float]
+Place = Direction
 
 COMPUTED = (np.dtype(np.float32), np.dtype(np.float64))
 """Types that are computed with."""
