@@ -159,8 +159,11 @@ def _njit_kept(function: Callable[..., Any], options: dict[str, Any]) -> Any:
         finally:
             numba.config.CACHE_DIR = before
         if folder in Path(kept.stats.cache_path).parents:
+            # numba has no public hook for a full disk; a numba without these names goes without.
+            cache = getattr(kept, '_cache', None)
             for name in ('load_overload', 'save_overload'):
-                setattr(kept._cache, name, _or_nothing(getattr(kept._cache, name)))
+                if hasattr(cache, name):
+                    setattr(cache, name, _or_nothing(getattr(cache, name)))
             return kept
         _log_not_kept(f'{folder} cannot be written to')
     return numba.njit(**options)(function)

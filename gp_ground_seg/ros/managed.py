@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
 from gp_ground_seg.core.errors import shown
@@ -44,18 +43,11 @@ class ManagedNode(LifecycleNodeMixin, node.GroundSegmentationNode):  # type: ign
         """Do what rclpy's callback `change` does; refuse a transition that there is not."""
         try:
             return change(request, response)
-        except rclpy_implementation.RCLError:
+        except RuntimeError:  # of rcl
             response.success = False
-            possible = ', '.join(
-                f'{number} ({label})'
-                for number, label, *_ in self._state_machine.available_transitions
-            )
             wanted = f'{request.transition.id} {shown(request.transition.label)}'.strip()
-            self.get_logger().warning(
-                f'transition {wanted} refused: the node is '
-                f'{self._state_machine.current_state[1]}, where there are {possible or "none"}',
-                **THROTTLED,
-            )
+            text = f'transition {wanted} refused: it is not possible in the present state'
+            self.get_logger().warning(text, **THROTTLED)
             return response
 
     def _load_backend(self, config: Config) -> None:
