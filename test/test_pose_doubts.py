@@ -53,6 +53,12 @@ def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicl
         # A smaller one that is given stays, and the paper's rule knows no height of the sensor.
         fine = config.replace(**{'label.ground_tolerance': 0.02})
         assert low_sensor.for_sensor(fine, pose, fine.sensor).label.ground_tolerance == 0.02
+        # What is at its least already is not refused.
+        least_of_all = {'growth.max_std': 0.001, 'growth.seed_height_tolerance': 0.01,
+                        'label.obstacle_min_height': 0.01, 'label.ground_tolerance': 0.001}  # fmt: skip
+        tiny = Config().replace(**least_of_all)
+        found = low_sensor.for_sensor(tiny, pose, tiny.sensor)
+        assert {name: found[name] for name in least_of_all} == least_of_all
         paper = config.replace(**{'label.rule': 'tolerance'})
         assert low_sensor.for_sensor(paper, pose, paper.sensor) is paper
     # The sensor is where the origin is given to be.

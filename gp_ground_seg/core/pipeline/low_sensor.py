@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from gp_ground_seg.core.parameters.config import Config, SensorConfig
+from gp_ground_seg.core.parameters.config import Config, SensorConfig, find_spec
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
 REFERENCE_HEIGHT = 1.0
@@ -32,17 +32,21 @@ def for_sensor(config: Config, pose: SensorPose, sensor: SensorConfig) -> Config
     share = sensor_height_of(pose, sensor) / REFERENCE_HEIGHT
     if share >= 1.0 or config.label.rule != 'roughness':
         return config
-    growth, label = config.growth, config.label
-    least_tolerance = min(LEAST_TOLERANCE, label.ground_tolerance)
+
+    def shrunk(name: str) -> float:
+        """Return a parameter in proportion, as far as it may be so small."""
+        return max(share * float(config[name]), float(find_spec(name).minimum or 0.0))
+
+    least_tolerance = min(LEAST_TOLERANCE, config.label.ground_tolerance)
     growth = dataclasses.replace(
-        growth,
-        seed_height_tolerance=share * growth.seed_height_tolerance,
-        max_std=share * growth.max_std,
+        config.growth,
+        seed_height_tolerance=shrunk('growth.seed_height_tolerance'),
+        max_std=shrunk('growth.max_std'),
     )
     label = dataclasses.replace(
-        label,
-        ground_tolerance=max(share * label.ground_tolerance, least_tolerance),
-        obstacle_min_height=share * label.obstacle_min_height,
+        config.label,
+        ground_tolerance=max(shrunk('label.ground_tolerance'), least_tolerance),
+        obstacle_min_height=shrunk('label.obstacle_min_height'),
     )
     return dataclasses.replace(config, growth=growth, label=label)
 
