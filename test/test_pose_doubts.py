@@ -54,8 +54,12 @@ def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicl
         fine = config.replace(**{'label.ground_tolerance': 0.02})
         assert low_sensor.for_sensor(fine, pose, fine.sensor).label.ground_tolerance == 0.02
         # What is at its least already is not refused.
-        least_of_all = {'growth.max_std': 0.001, 'growth.seed_height_tolerance': 0.01,
-                        'label.obstacle_min_height': 0.01, 'label.ground_tolerance': 0.001}  # fmt: skip
+        least_of_all = {
+            'growth.max_std': 0.001,
+            'growth.seed_height_tolerance': 0.01,
+            'label.obstacle_min_height': 0.01,
+            'label.ground_tolerance': 0.001,
+        }
         tiny = Config().replace(**least_of_all)
         found = low_sensor.for_sensor(tiny, pose, tiny.sensor)
         assert {name: found[name] for name in least_of_all} == least_of_all
