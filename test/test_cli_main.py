@@ -7,11 +7,13 @@ import re
 import shlex
 import subprocess
 import sys
+import time
 
 import pytest
 from cli_runner import error_line
 
 from gp_ground_seg.cli import main as cli
+from gp_ground_seg.cli import options
 from gp_ground_seg.cli.experiment import EXPERIMENTS
 from gp_ground_seg.cli.options import library_notes
 from gp_ground_seg.core.parameters.removed import PROGRAM, REMOVED
@@ -174,3 +176,22 @@ def test_what_the_library_logs_is_said_within_a_command_only(capsys):
     assert capsys.readouterr().err == (
         'gp-ground-seg: note: compiling this\ngp-ground-seg: note: cannot be kept\n'
     )
+
+
+def test_a_run_without_a_terminal_has_a_line_every_half_minute(capsys, monkeypatch):
+    for _ in options.progress('segment')(range(3)):
+        pass
+    assert capsys.readouterr().err == ''
+    assert options.LINE_PERIOD == 30.0
+    monkeypatch.setattr(options, 'LINE_PERIOD', 0.05)
+    with options.progress('evaluate')(total=10) as bar:
+        for _ in range(10):
+            time.sleep(0.02)
+            bar.update()
+    lines = capsys.readouterr().err.splitlines()
+    assert 1 <= len(lines) <= 4
+    for line in lines:
+        assert re.fullmatch(r'evaluate: \d of 10 frames, 00:00 gone, 00:0\d left', line)
+    for _ in options.progress('segment', quiet=True)(range(5)):
+        time.sleep(0.06)
+    assert capsys.readouterr().err == ''
