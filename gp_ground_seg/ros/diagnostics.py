@@ -20,7 +20,9 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.ros.input import STEADY_CLOCK
 
 RATE_WINDOW = 10.0  # time over which rates are taken [s]
-LOG_PERIOD = 10.0  # shortest time between two lines of the log that say that the node works [s]
+FIRST_LOG, LOG_PERIOD = 10.0, 60.0
+"""Time from the first cloud to the line of the log that says that the node works, and from there
+to the next one, at least [s]."""
 CLOUD_WINDOW = 100  # clouds over which the median of the latency is taken
 Level = IntEnum('Level', 'OK WARN ERROR STALE', start=0)
 """Severity, with the values of ``diagnostic_msgs/DiagnosticStatus``."""
@@ -319,7 +321,7 @@ class Diagnostics:
         self.input = InputTask(time.monotonic())
         self.processing, self.model, self.output = ProcessingTask(), ModelTask(), OutputTask()
         self._node, self._state, self._limits = node, state, limits
-        self._logged, self._n_logged = -np.inf, '0'
+        self._next_log, self._n_logged = np.inf, '0'
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._timer = node.create_timer(limits.period, self._publish, clock=STEADY_CLOCK)
 
@@ -345,11 +347,13 @@ class Diagnostics:
     def _log(self, now: float, values: Mapping[str, str]) -> None:
         """Log that the node works, if it has processed clouds since the last such line."""
         n = values['Clouds since startup']
-        if n == self._n_logged or now - self._logged < LOG_PERIOD:
+        if n != '0' and self._next_log == np.inf:
+            self._next_log = now + FIRST_LOG
+        if n == self._n_logged or now < self._next_log:
             return
-        self._logged, self._n_logged = now, n
+        self._next_log, self._n_logged = now + LOG_PERIOD, n
         self._node.get_logger().info(
-            f'{n} clouds segmented so far, {values["Actual frequency (Hz)"]} Hz, '
+            f'{n} cloud{"s" * (n != "1")} segmented so far, {values["Actual frequency (Hz)"]} Hz, '
             f'median latency {values["Median latency (ms)"]} ms, '
             f'share of ground {values["Ground fraction"]}'
         )
