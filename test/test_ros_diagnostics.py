@@ -30,7 +30,7 @@ from gp_ground_seg.ros.diagnostics import (
 from gp_ground_seg.ros.input import JUMP_TOLERANCE, TimeJumps
 
 LIMITS = DiagnosticsConfig(stale_after=2.0, max_latency=0.1)
-FACTS = InputFacts('/points', 'reliable, keep_last 5, volatile', n_publishers=1, ros_time=1000.5)
+FACTS = InputFacts('/points', 'reliable, keep_last 1, volatile', n_publishers=1, ros_time=1000.5)
 
 times = st.floats(0.0, 5.0)
 

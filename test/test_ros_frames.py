@@ -208,6 +208,7 @@ def test_outputs_in_a_frame_of_tf_at_the_stamp(monkeypatch):
     monkeypatch.setattr(StandInBuffer, 'newest', 2)
     points, turn = turned_street(yaw=1.0)
     values = {**VALUES, 'frame.level': 'tf', 'output.frame': 'odom', 'diagnostics.period': 0.1}
+    values[f'qos_overrides.{ros.NAMESPACE}/points.subscription.depth'] = 5
     with bench(*ros.given(values)) as b:
         names = {'scan': LaserScan, 'occupancy': OccupancyGrid}
         maps = [ros.Collector(b.probe, kind, f'{NODE_NAME}/{n}') for n, kind in names.items()]

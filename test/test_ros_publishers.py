@@ -19,6 +19,7 @@ from gp_ground_seg.ros.input import SequenceGaps
 CHANGES = {
     'learning.mode': 'fixed', 'runtime.backend': 'numpy', 'grid.n_segments': 16,
     'diagnostics.period': 0.2, 'diagnostics.max_latency': 10.0, 'diagnostics.stale_after': 60.0,
+    f'qos_overrides.{ros.NAMESPACE}/points.subscription.depth': 5,
 }  # fmt: skip
 SMALL = to_message(street(500))
 MIDDLE = to_message(street(6000))

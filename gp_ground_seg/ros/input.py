@@ -18,7 +18,7 @@ from sensor_msgs.msg import PointCloud2
 from gp_ground_seg.core.errors import ConfigError
 
 CLOUD_TYPE = 'sensor_msgs/msg/PointCloud2'
-INPUT_DEPTH = 5  # clouds that may wait to be processed: half a second of a LiDAR at 10 Hz
+INPUT_DEPTH = 1  # clouds that may wait to be processed: the newest, which is worth most
 OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 0.7 s only
 MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
