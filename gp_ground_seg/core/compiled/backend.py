@@ -38,7 +38,7 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.gp.evidence import CLEARLY, ODDS, STEP, uses_neighbours_in
 from gp_ground_seg.core.gp.latent import given_log_length_scales
-from gp_ground_seg.core.gp.learning import BUDGET, Learned, given_theta, theta_space
+from gp_ground_seg.core.gp.learning import Learned, given_theta, theta_space
 from gp_ground_seg.core.gp.search import search_from
 from gp_ground_seg.core.jit import announce_compiling, keep_code
 from gp_ground_seg.core.parameters.config import Config
@@ -135,41 +135,25 @@ class NumbaBackend:
 
     def learn_frame(self, frame: Frame, config: Config) -> Learned:
         """Hyper-parameters of the frame."""
-        frame, space = frame._replace(knots=frame.knots[:0]), theta_space(config)
-        observation, growth = numbers_of(config.observation), numbers_of(config.growth)
-        learning_, slope_std = config.learning, config.observation.slope_std
-        is_map, step = learning_.objective == 'map', learning_.segment_step
-        odds = ODDS if config.label.rule == 'roughness' else 0.0
-        u, knot_u = self._given_length_scales(frame, config)
-        by_itself, nothing = self._surfaces(u, knot_u), np.empty((2, 0, 0))
-        theta, outcome = given_theta(config), np.array([-math.inf, BUDGET, 0.0])
-        search = search_from(theta, space.lower.copy(), space.upper.copy())
-        learning.begin_learning(frame, growth, step, by_itself, theta)
-        n_rounds = n_evaluations = 0
-        budget = max(learning_.max_evaluations // 2, 1)
-        while budget > 0:
-            if config.length_scale.model == 'latent':
-                latent_.latent_log_length_scales(frame, theta, step, u, knot_u)
-            ground.grow_surfaces(frame, theta, observation, growth, odds, nothing, step, by_itself)
-            least = int(outcome[2]) + 1 if n_rounds >= 2 else 0
-            n = learning.learn_round(
-                frame,
-                space,
-                slope_std,
-                is_map,
-                step,
-                least,
-                budget,
-                by_itself,
-                search,
-                theta,
-                outcome,
-            )
-            if n < 0:
-                break
-            n_rounds, n_evaluations = n_rounds + 1, n_evaluations + n
-            budget = learning_.max_evaluations - n_evaluations
-        return Learned.of(theta, float(outcome[0]), n_evaluations, int(outcome[1]), space)
+        no_knots, space = frame._replace(knots=frame.knots[:0]), theta_space(config)
+        u, knot_u = self._given_length_scales(no_knots, config)
+        by_itself = self._surfaces(u, knot_u)
+        theta, outcome = given_theta(config), np.empty(2)
+        n = learning.learn_frame(
+            no_knots,
+            space,
+            numbers_of(config.observation),
+            numbers_of(config.growth),
+            numbers_of(config.learning),
+            config.learning.objective == 'map',
+            config.length_scale.model == 'latent',
+            ODDS if config.label.rule == 'roughness' else 0.0,
+            by_itself,
+            search_from(theta, space.lower.copy(), space.upper.copy()),
+            theta,
+            outcome,
+        )
+        return Learned.of(theta, float(outcome[0]), n, int(outcome[1]), space)
 
     def estimate_surface(
         self, frame: Frame, theta: FloatArray, config: Config

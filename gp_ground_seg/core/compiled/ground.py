@@ -71,7 +71,7 @@ class _Columns(NamedTuple):
     z, noise : (n,) float64
         Heights of the candidates about the prior mean [m], and variances of the noise with which
         they are observed [m^2].
-    neighbour_height, aside_precision : (n,) float64
+    neighbour_height, neighbour_precision : (n,) float64
         Evidence at the candidates.
     above : (n,) bool
         Candidates that the evidence contradicts.

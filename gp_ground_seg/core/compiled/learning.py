@@ -1,7 +1,4 @@
-"""Compiled twin of `gp_ground_seg.core.gp.learning`.
-
-A round is a call of its own: in one with the growth, that would be compiled a second time.
-"""
+"""Compiled twin of `gp_ground_seg.core.gp.learning`: all rounds of a frame in one call."""
 
 from __future__ import annotations
 
@@ -9,7 +6,8 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.core.compiled.ground import SegmentSurfaces
+from gp_ground_seg.core.compiled.ground import SegmentSurfaces, grow_surfaces
+from gp_ground_seg.core.compiled.latent import latent_log_length_scales
 from gp_ground_seg.core.compiled.likelihood import log_likelihood
 from gp_ground_seg.core.frame import FloatArray, Frame, Inliers
 from gp_ground_seg.core.gp.evidence import is_low_and_near
@@ -25,45 +23,55 @@ from gp_ground_seg.core.gp.learning import (
 )
 from gp_ground_seg.core.gp.search import Search, begin, propose, take_outcome
 from gp_ground_seg.core.jit import jit
-from gp_ground_seg.core.parameters.config import GrowthConfig
+from gp_ground_seg.core.parameters.config import GrowthConfig, LearningConfig, ObservationConfig
 
 
 @jit(entry=True)
-def begin_learning(
-    frame: Frame, growth: GrowthConfig, step: int, by_itself: SegmentSurfaces, theta: FloatArray
-) -> None:
-    """Set the first theta (T,), which holds the given values, and the seeds."""
-    _set_first_theta(frame, growth, theta)
-    _set_seeds(frame, growth, step, by_itself)
-
-
-@jit(entry=True)
-def learn_round(
+def learn_frame(
     frame: Frame,
     space: ThetaSpace,
-    slope_std: float,
+    observation: ObservationConfig,
+    growth: GrowthConfig,
+    learning: LearningConfig,
     is_map: bool,
-    step: int,
-    least: int,
-    max_evaluations: int,
+    is_latent: bool,
+    odds: float,
     by_itself: SegmentSurfaces,
     search: Search,
     theta: FloatArray,
     outcome: FloatArray,
 ) -> int:
-    """Learn theta (T,) on the inliers of every `step`-th segment; return how many evaluations.
+    """Do what the twin does, into `theta` (T,), which holds the given values.
 
-    Returns -1 if there are fewer inliers than `least`. Sets `outcome` (3,) to the objective, the
-    place of the status in `STATUSES`, and the number of inliers. `is_map` is the objective.
+    The frame has no knots. `is_map` and `is_latent` are the objective and the model of the
+    length-scale, `odds` as of `grow_surfaces`; `by_itself` has no knots, and the log length-scales
+    at the candidates if these are given. Sets `outcome` (2,) to the objective and the place of the
+    status in `STATUSES`, and returns the number of evaluations.
     """
-    has_latent = False
+    _set_first_theta(frame, growth, theta)
+    step, nothing, has_latent = learning.segment_step, np.empty((2, 0, 0)), False
     for i in range(2, len(theta)):
         has_latent |= space.free[i]
-    inliers = _take_inliers(frame, step, has_latent, by_itself)
-    if len(inliers.r) < least:
-        return -1
-    outcome[2] = len(inliers.r)
-    return _maximise(space, inliers, slope_std, is_map, max_evaluations, search, theta, outcome)
+    outcome[0], outcome[1] = -math.inf, BUDGET
+    n_rounds = n_before = n_evaluations = 0
+    budget = max(learning.max_evaluations // 2, 1)
+    while budget > 0:
+        if is_latent:
+            at_knots = by_itself.knot_log_length_scale
+            latent_log_length_scales(frame, theta, step, by_itself.log_length_scale, at_knots)
+        _set_seeds(frame, growth, step, by_itself)
+        grow_surfaces(frame, theta, observation, growth, odds, nothing, step, by_itself)
+        inliers = _take_inliers(frame, step, has_latent, by_itself)
+        n_rounds += 1
+        if n_rounds > 2 and len(inliers.r) <= n_before:
+            break
+        n_before = len(inliers.r)
+        slope_std = observation.slope_std
+        n_evaluations += _maximise(
+            space, inliers, slope_std, is_map, budget, search, theta, outcome
+        )
+        budget = learning.max_evaluations - n_evaluations
+    return n_evaluations
 
 
 @jit(part=True)
