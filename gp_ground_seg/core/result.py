@@ -214,7 +214,8 @@ class Segmentation:
     @property
     def is_ground(self) -> BoolArray:
         """Whether each point is GROUND, (N,)."""
-        is_ground: BoolArray = self.label == Label.GROUND
+        # Comparing with an enumeration is five times slower.
+        is_ground: BoolArray = self.label == int(Label.GROUND)
         return is_ground
 
     def __repr__(self) -> str:

@@ -33,8 +33,8 @@ DIRECTIONS = 720
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Values of cells, those of ``nav_msgs/OccupancyGrid``."""
 
-# Plain integers: comparing with an enumeration is five times slower.
-_GROUND, _OBSTACLE = int(Label.GROUND), int(Label.OBSTACLE)
+# A plain integer: comparing with an enumeration is five times slower.
+_OBSTACLE = int(Label.OBSTACLE)
 _ROWS = 32  # rows of cells at a time: their arrays stay in the cache
 
 Ranges = npt.NDArray[np.float32]
@@ -84,8 +84,7 @@ class SegmentedCloud:
     @cached_property
     def is_ground(self) -> BoolArray:
         """Ground points, (N,) bool."""
-        is_ground: BoolArray = self.segmentation.label == _GROUND
-        return is_ground
+        return self.segmentation.is_ground
 
     @cached_property
     def is_obstacle(self) -> BoolArray:
@@ -143,7 +142,7 @@ class SegmentedCloud:
         with np.errstate(over='ignore', invalid='ignore'):
             xyz = (self.points - found.origin) @ found.pose.rotation.T
         xyz[found.grid.cell == NOT_FINITE] = np.nan
-        edges = find_edges(xyz, found.label == _GROUND, stands, output.max_step_down)
+        edges = find_edges(xyz, self.is_ground, stands, output.max_step_down)
         return edges.points() @ found.pose.rotation + found.origin
 
     def _in_plane(self, x: PointArray, y: PointArray, z: PointArray) -> Places:

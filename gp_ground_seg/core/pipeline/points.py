@@ -27,7 +27,8 @@ _N_JUDGED = 1000  # points looked at in a larger cloud
 _MANY, _MANY_SHARE = 1000, 0.03  # points, and share of all, that repeat one place: no returns do
 _FARTHEST_MOUNT = 5.0  # distance of such a place from the origin of a vehicle's cloud [m]
 _N_ALIKE = 10  # points of a sample of `_N_JUDGED` that show such a place
-# Places of a sample along the points, of 1, that no number of rings or columns is a multiple of.
+# Where a sample is taken, as shares of the number of points: in steps of the golden ratio, which
+# fall on all rings and columns alike.
 _SAMPLE = np.arange(_N_JUDGED) * ((math.sqrt(5.0) - 1.0) / 2.0) % 1.0
 _MOST_ROWS, _LEAST_COLUMNS = 8, 65  # of an array that is taken for a transposed one
 _Float = TypeVar('_Float', np.float32, np.float64)
