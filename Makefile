@@ -14,7 +14,7 @@ help:
 	@echo 'make test      the tests, but those marked slow (KITTI=PATH adds labelled frames)'
 	@echo 'make test-all  all tests'
 	@echo 'make browser-test  the page of tune in a headless Chromium, which root gets by apt'
-	@echo 'make torture   adversarial clouds, files and uses (TORTURE_SCALE=100 for a night)'
+	@echo 'make torture   hostile clouds, files and messages (TORTURE_SCALE=100 for a night)'
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
 	@echo 'make figures   every table and picture of README and docs anew (needs KITTI=PATH; ONLY=word for some)'
 	@echo 'make docs      the documentation as HTML, in build/docs'

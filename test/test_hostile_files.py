@@ -6,7 +6,6 @@ import sys
 
 import numpy as np
 import pytest
-import torture_commands
 from bag_samples import scan, write_ros2_bag
 from cli_runner import error_line, run
 from evaluation_samples import write_frame
@@ -14,15 +13,6 @@ from evaluation_samples import write_frame
 from gp_ground_seg.core.errors import shown
 
 NAMES = ['a\x1b[31m\nb', os.fsdecode(b'a\xff\xfe'), 'a$\\x_{$', '[a*]{0}%s', ' a ']
-
-
-@pytest.mark.parametrize('first', [0, pytest.param(40, marks=pytest.mark.slow)])
-def test_wrong_commands_are_one_line_and_change_nothing(first):
-    pytest.importorskip('rclpy', reason='ROS is not installed')
-    stop = 40 if first == 0 else 300
-    with torture_commands.world() as place:
-        wrong = [torture_commands.run_case(number, place) for number in range(first, stop)]
-    assert [line for line in wrong if line] == []
 
 
 def test_a_text_is_shown_in_one_line():

@@ -1,142 +1,476 @@
-"""The torture campaign: `make torture`, `TORTURE_SCALE=100 make torture` for a night.
+"""Hostile clouds, files and messages: `python test/torture.py`, TORTURE_SCALE=100 for a night.
 
-Each part is a script that runs a range of numbered cases and prints a line for each that fails; a
-case follows from its number. Finished ranges are written to the state file, so that a campaign
-that was stopped goes on where it was. The record (docs/reliability.md shows the last one) is
-printed at the end. The clouds take hours: what ran stays valid on later commits whose segmentation
-is the same to the byte.
+Each case follows from its number. `python test/torture.py PART FIRST STOP` runs some of a part in
+this process, and prints a line for each that fails. Without words, each part runs in processes of
+a hundred cases or so, where a crash or a hang is a failure too, and a record is printed at the end
+(docs/reliability.md shows the last one).
 """
 
-import argparse
-import hashlib
-import json
+import contextlib
+import io
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Sequence
+import warnings
+from array import array
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+
+import numpy as np
+from bag_samples import scan, write_ros1_bag, write_ros2_bag
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rclpy.serialization import serialize_message
+from ros_helpers import SETTERS, linked_process, street, to_message
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointField
+
+from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
+from gp_ground_seg.cli import main as cli
+from gp_ground_seg.core.parameters.config import parameter_specs
+from gp_ground_seg.core.pipeline.points import take_points
+from gp_ground_seg.data.cloud_files import WRITABLE, encode_file
+from gp_ground_seg.data.clouds import cloud_of, name_columns
 
 TEST = Path(__file__).parent
-SEGMENTATION = ('test/torture_clouds.py', 'test/torture_cases.py', 'gp_ground_seg/core')
+PARTS = {'clouds': (1000, 100), 'allocator': (100, 50), 'files': (600, 200), 'ros': (400, 200)}
+"""Number of cases of a short campaign, and of a process."""
+DEBUGGING = {'PYTHONMALLOC': 'debug', 'MALLOC_PERTURB_': '165'}
+"""Environment of the clouds of `allocator`."""
+TIMEOUT = 900.0
+"""Time that a process may take [s]."""
+SLOWEST = 30.0
+"""Time that a command may take [s]."""
+MAX_DIFFERENT = 0.02
+"""Share of the points that rounding may decide differently in the two backends: one candidate
+that joins or not changes the labels of its cells."""
+SPECIAL = [np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-40, -1e-40, 1e-7, 1e7, 3e38, -3e38, 1e300]
 
 
-class Part(NamedTuple):
-    """A script, and how many cases make the short campaign of a few minutes."""
-
-    script: str
-    n_cases: int
-    chunk: int  # cases of one process
-    environment: tuple[str, ...] = ()  # NAME=value
-    timeout: float = 900.0  # of one process [s]
-    sources: Sequence[str] = ('.',)  # paths that the outcome depends on
-
-
-PARTS = {
-    'clouds': Part('torture_clouds.py', 1000, 100, sources=SEGMENTATION),
-    'clouds, debugging allocator': Part(
-        'torture_clouds.py', 100, 50, ('PYTHONMALLOC=debug', 'MALLOC_PERTURB_=165'),
-        sources=SEGMENTATION,
-    ),
-    'threads, processes, signals, limits': Part('torture_processes.py', 90, 9),
-    'damaged compiled code': Part('torture_cache.py', 40, 20),
-    'commands killed, interrupted, disk full': Part('torture_writes.py', 40, 20),
-    'data sets that change, two runs at once': Part('torture_resume.py', 120, 40),
-    'damaged files': Part('torture_files.py', 600, 200),
-    'wrong commands': Part('torture_commands.py', 1000, 250),
-    'page of tune': Part('torture_servers.py', 200, 100),
-    'hostile messages and calls over DDS': Part('torture_ros.py', 400, 200),
-}  # fmt: skip
-
-
-def git(*words):
-    """Output of a git command in this repository, '' where there is none."""
-    done = subprocess.run(
-        ['git', *words], cwd=TEST.parent, capture_output=True, text=True, check=False
+def random_cloud(rng):
+    """Cloud of a random kind, size, type and layout."""
+    n = int(
+        rng.choice([0, 1, 2, 3, 7, 60, 500, 3000, 9000], p=[0.03] * 4 + [0.08] * 2 + [0.24] * 3)
     )
-    return done.stdout.strip()
+    azimuth, r = rng.uniform(-np.pi, np.pi, n), rng.gamma(2.0, rng.choice([0.5, 5.0, 40.0]), n)
+    z = rng.normal(rng.choice([-1.73, 0.0, -0.2, 5.0]), rng.choice([0.0, 0.02, 1.0, 50.0]), n)
+    if rng.random() < 0.5:  # rings of beams, walls where they end
+        depression = rng.choice(np.linspace(0.02, 0.5, 16), n)
+        height = rng.uniform(0.2, 3.0)
+        r = np.minimum(height / np.tan(depression), rng.choice([5.0, 30.0, 100.0]))
+        z = -r * np.tan(depression) + rng.normal(0.0, 0.02, n)
+    xyz = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), z])
+    kind = rng.integers(8)
+    if kind == 0 and n:  # many points in one place
+        xyz[: n // 2] = xyz[0]
+    elif kind == 1:  # values on the edges of cells and tiles
+        xyz = np.round(xyz * 2.0) / 2.0
+    elif kind == 2:  # in one line, plane or axis
+        xyz[:, rng.integers(3)] = rng.choice([0.0, 1.0, -1.73])
+    elif kind == 3:
+        xyz *= 10.0 ** rng.uniform(-20, 20)
+    elif kind == 4:  # tilted
+        xyz = xyz @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    if rng.random() < 0.5 and n:
+        where = rng.random(xyz.shape) < rng.choice([0.001, 0.05, 0.9])
+        xyz[where] = rng.choice(SPECIAL, where.sum())
+    dtype = rng.choice(['float32', 'float64', 'float16', '>f4'])
+    with np.errstate(over='ignore', invalid='ignore'):
+        xyz = xyz.astype(dtype)
+    layout = rng.integers(4)
+    if layout == 0:
+        xyz = np.asfortranarray(xyz)
+    elif layout == 1:
+        xyz = np.column_stack([xyz, xyz])[:, :4]
+    elif layout == 2:
+        xyz = np.repeat(xyz, 2, axis=0)[::2]
+    elif layout == 3:
+        xyz = xyz[::-1]
+    return xyz
 
 
-def run_chunk(part, first, stop):
-    """Return the lines of the cases that failed; a crash or a hang is one."""
-    command = [sys.executable, TEST / part.script, str(first), str(stop)]
-    environment = {**os.environ, **dict(pair.split('=') for pair in part.environment)}
-    environment['PYTHONPATH'] = os.pathsep.join([str(TEST.parent), str(TEST)])
+def random_config(rng):
+    """Some parameters anywhere in their declared ranges; those that contradict are drawn again."""
+    others = ('runtime', 'frame', 'input', 'output', 'diagnostics')
+    specs = [s for s in parameter_specs() if s.name.split('.')[0] not in others]
+    while True:
+        changes = {}
+        for index in rng.choice(len(specs), rng.choice([0, 1, 3, 10, 40]), replace=False):
+            spec = specs[index]
+            if spec.type is bool:
+                changes[spec.name] = bool(rng.integers(2))
+            elif spec.type is str:
+                changes[spec.name] = str(rng.choice(spec.choices))
+            elif rng.random() < 0.3:
+                changes[spec.name] = rng.choice([spec.minimum, spec.maximum])
+            elif spec.minimum > 0.0:
+                low, high = np.log([spec.minimum, spec.maximum])
+                changes[spec.name] = min(float(np.exp(rng.uniform(low, high))), spec.maximum)
+            else:
+                changes[spec.name] = rng.uniform(spec.minimum, spec.maximum)
+            if spec.type is int:
+                changes[spec.name] = int(changes[spec.name])
+        # Another test tries large grids; here they would take the night.
+        changes['grid.n_segments'] = min(changes.get('grid.n_segments', 180), 720)
+        changes['grid.n_bins'] = min(changes.get('grid.n_bins', 160), 400)
+        changes['faces.cell_size'] = max(changes.get('faces.cell_size', 0.5), 0.25)
+        changes['learning.max_evaluations'] = min(changes.get('learning.max_evaluations', 4), 8)
+        try:
+            return Config().replace(**changes)
+        except ConfigError:
+            continue
+
+
+def is_return(xyz):
+    """Which points are finite, not at the origin, and not where very many are."""
+    known = np.isfinite(xyz).all(axis=1) & (xyz != 0.0).any(axis=1)
+    if len(xyz) < 1000:
+        return known
+    taken = take_points(xyz, (0.0, 0.0, 0.0))
+    dropped = known & np.isnan(taken).any(axis=1)
+    places, number = np.unique(xyz[dropped], axis=0, return_counts=True)
+    assert (number >= 1000).all() and (np.linalg.norm(places, axis=1) < 5.01).all(), 'returns'
+    return known & ~dropped
+
+
+def check(points, result):
+    """Raise AssertionError unless what must always hold does."""
+    n, known = len(points), is_return(points[:, :3])
+    label, height = result.label, result.height
+    assert label.shape == height.shape == result.p_ground.shape == (n,), 'length'
+    assert np.isin(label, [Label.UNKNOWN, Label.GROUND, Label.OBSTACLE]).all(), 'classes'
+    assert ((label == Label.UNKNOWN) == ~known).all(), 'UNKNOWN is what is no return'
+    ground = label == Label.GROUND
+    assert np.isfinite(height[ground]).all(), 'NaN height on ground'
+    for std in (result.ground_std, result.return_std):
+        assert np.isfinite(std[ground]).all(), 'NaN std on ground'
+    assert (result.margin[ground] >= 0.0).all(), 'negative margin on ground'
+    assert (result.p_ground[ground] >= 0.5).all(), 'p_ground of ground below one half'
+    assert (np.isnan(result.p_ground) == ~known).all(), 'p_ground'
+
+
+def segment_or_error(segmenter, points):
+    """Return the result, or the error as one line."""
     try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, errors='replace', env=environment,
-            timeout=part.timeout, check=False,
-        )  # fmt: skip
+        return segmenter.segment(points)
+    except PointCloudError as error:
+        return str(error)
+
+
+def try_cloud(number):
+    """Segment a random cloud under random parameters; raise unless what must hold does."""
+    rng = np.random.default_rng([2112, number])
+    points, config = random_cloud(rng), random_config(rng)
+    before = points.tobytes()
+    compiled, plain = (
+        GroundSegmenter(config.replace(**{'runtime.backend': name})) for name in ('numba', 'numpy')
+    )
+    results = [segment_or_error(segmenter, points) for segmenter in (compiled, compiled, plain)]
+    assert points.tobytes() == before, 'the input was written to'
+    if isinstance(results[0], str):
+        assert results[0] == results[1] == results[2], results
+        assert '\n' not in results[0], 'an error of more than a line'
+        return
+    for result in results:
+        assert not isinstance(result, str), result
+        check(points, result)
+    one, again, other = results
+    assert np.array_equal(one.label, again.label), 'labels depend on the scan before'
+    assert np.array_equal(one.height, again.height, equal_nan=True), 'so do heights'
+    n_different = np.count_nonzero(one.label != other.label)
+    assert n_different <= max(2, MAX_DIFFERENT * len(points)), (
+        f'numba and numpy differ in {n_different} of {len(points)} labels'
+    )
+
+
+YAML_PIECES = [b'1' * 5000, *rb"""
+*a
+&a [*a, *a]
+1e999
+.nan
+-.inf
+0x7f
+2011-99-99
+!!python/name:os
+~
+[1, 2]
+{a: b}
+true
+"\ud800"
+-
+?
+grid:
+r_max: 1
+""".split(b'\n'), b'\t', b'\x00', b'\xff', b'\n']  # fmt: skip
+
+
+def answer(words):
+    """Exit code and stderr of a command in this process."""
+    errors = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(errors):
+            code = cli.main([str(word) for word in words])
+    except SystemExit as stop:
+        code = stop.code
+    return code, errors.getvalue()
+
+
+def damage(data, rng, is_text):
+    """Return the bytes changed in one to three places."""
+    data = bytearray(data)
+    for _ in range(rng.integers(1, 4)):
+        at, size = int(rng.integers(len(data) + 1)), int(rng.choice([1, 4, 30, 500]))
+        kind = rng.integers(6)
+        if kind == 0:
+            data[at : at + size] = rng.bytes(len(data[at : at + size]))
+        elif kind == 1:
+            del data[at:]
+        elif kind == 2:
+            del data[at : at + size]
+        elif kind == 3:
+            data[at:at] = data[at : at + size]
+        elif kind == 4:
+            data[at : at + size] = bytes(len(data[at : at + size]))
+        elif is_text:
+            data[at:at] = YAML_PIECES[rng.integers(len(YAML_PIECES))]
+        else:
+            data[at : at + 4] = rng.choice(
+                [b'\xff\xff\xff\xff', b'\xff\xff\xff\x7f', b'\0\0\0\x80']
+            )
+    return bytes(data)
+
+
+def make_samples(folder):
+    """Valid files: name -> (path of what is damaged, words of the command)."""
+    points = scan()
+    points.tofile(folder / 'scan.bin')
+    root = folder / 'root' / 'sequences' / '00'
+    (root / 'velodyne').mkdir(parents=True)
+    (root / 'labels').mkdir()
+    points.tofile(root / 'velodyne' / '000000.bin')
+    np.full(len(points), 40, '<u4').tofile(root / 'labels' / '000000.label')
+    with contextlib.redirect_stdout(io.StringIO()) as text:
+        assert cli.main(['config', 'dump']) == 0
+    (folder / 'robot.yaml').write_text(text.getvalue())
+    write_ros2_bag(folder / 'drive.mcap')
+    write_ros2_bag(folder / 'drive.db3')
+    write_ros1_bag(folder / 'drive.bag')
+    write_ros2_bag(folder / 'drive')
+    out = ['-o', folder / 'out.mcap']
+    robot = folder / 'robot.yaml'
+    samples = {
+        'scan': (folder / 'scan.bin', ['segment', folder / 'scan.bin']),
+        'scan of a root': (root / 'velodyne' / '000000.bin', ['evaluate', folder / 'root']),
+        'labels': (root / 'labels' / '000000.label', ['evaluate', folder / 'root']),
+        'parameters': (robot, ['config', 'check', robot]),
+        'parameters used': (robot, ['segment', folder / 'scan.bin', '--config', robot]),
+    }
+    for name in ('drive.mcap', 'drive.db3', 'drive.bag'):
+        samples[name] = (folder / name, ['segment', folder / name, *out])
+    cloud = cloud_of(name_columns(points))
+    for suffix in WRITABLE:
+        path = folder / f'cloud{suffix}'
+        path.write_bytes(encode_file(path, cloud, {}))
+        samples[path.name] = (path, ['segment', path, '-o', folder / 'out.npz'])
+    for path in sorted((folder / 'drive').iterdir()):
+        samples[f'drive/{path.name}'] = (path, ['segment', folder / 'drive', *out])
+    return samples
+
+
+def try_file(number, samples, folder):
+    """Damage one file, run its command, restore the file; return what is wrong, or None."""
+    rng = np.random.default_rng([41, number])
+    name = list(samples)[number % len(samples)]
+    path, words = samples[name]
+    whole = path.read_bytes()
+    outputs = [folder / 'out.mcap', folder / 'out.npz']
+    try:
+        path.write_bytes(damage(whole, rng, path.suffix == '.yaml'))
+        started = time.monotonic()
+        try:
+            code, errors = answer(words)
+        except BaseException as error:
+            return f'{name}: {type(error).__name__}: {" ".join(str(error).split())[:200]}'
+        # `config check` prints a line for each problem, other commands one error.
+        mark = str(path) if words[1] == 'check' else 'error: '
+        n_lines = sum(mark in line for line in errors.splitlines())
+        if code not in (0, 2) or (code == 2 and not (n_lines == 1 or words[1] == 'check')):
+            return f'{name}: exit code {code}, {errors[-200:]!r}'
+        if code == 2 and any(out.exists() for out in outputs):
+            return f'{name}: something was written'
+        if time.monotonic() - started > SLOWEST:
+            return f'{name}: took {time.monotonic() - started:.0f} s'
+        left = [p.name for p in folder.iterdir() if 'out' in p.name and p not in outputs]
+        return f'{name}: left {left}' if left else None
+    finally:
+        path.write_bytes(whole)
+        for leftover in folder.glob('*out*'):
+            if leftover.is_dir():
+                shutil.rmtree(leftover)
+            else:
+                leftover.unlink()
+
+
+MAX_RSS = 1.5e9
+"""Memory that the node may hold [bytes]."""
+
+
+def hostile_cloud(rng):
+    """Cloud whose layout, sizes and fields are drawn at random, near to what is valid."""
+    message = to_message(street(int(rng.choice([0, 1, 50, 500])), seed=int(rng.integers(1000))))
+    sizes = [0, 1, 2, 3, 12, 16, 63, 65, 1000, 2**16, 2**31 - 1, 2**31, 2**32 - 1]
+    for name in ('height', 'width', 'point_step', 'row_step'):
+        if rng.random() < 0.4:
+            setattr(message, name, int(rng.choice(sizes)))
+    for field in message.fields:
+        if rng.random() < 0.3:
+            field.offset = int(rng.choice(sizes))
+        if rng.random() < 0.2:
+            field.datatype = int(rng.integers(0, 256))
+        if rng.random() < 0.2:
+            field.count = int(rng.choice(sizes))
+        if rng.random() < 0.1:
+            field.name = str(rng.choice(['', 'x', 'y', 'z', 'label', 'ground_z', '\0', 'é' * 50]))
+    if rng.random() < 0.2:
+        message.fields = message.fields[: rng.integers(5)]
+    if rng.random() < 0.2:
+        message.fields = [*message.fields, PointField(name='x', datatype=7, count=1)]
+    if rng.random() < 0.3:
+        message.data = array('B', rng.bytes(int(rng.choice([0, 1, 100, 64000]))))
+    message.is_bigendian = bool(rng.random() < 0.2)
+    if rng.random() < 0.2:
+        message.header.frame_id = str(rng.choice(['', '/', 'a b', 'é', 'x' * 3000]))
+    if rng.random() < 0.2:
+        message.header.stamp.sec = int(rng.choice([-(2**31), -1, 0, 2**31 - 1]))
+        message.header.stamp.nanosec = int(rng.choice([0, 10**9, 2**32 - 1]))
+    return message
+
+
+def damaged_message(rng):
+    """Serialized valid cloud with bytes flipped, mostly in what comes before the points."""
+    data = bytearray(serialize_message(to_message(street(100, seed=int(rng.integers(1000))))))
+    for _ in range(rng.integers(1, 6)):
+        data[rng.integers(min(len(data), rng.choice([60, 250, len(data)])))] = rng.integers(256)
+    return bytes(data[: rng.integers(1, len(data) + 1)] if rng.random() < 0.1 else data)
+
+
+def hostile_parameter(rng, kind):
+    """Parameter of the type `kind` in [0, 256), whose values fit it or not."""
+    names = 'grid.r_max', 'label.ground_tolerance', 'runtime.backend', 'use_sim_time'
+    return Parameter(
+        name=str(rng.choice([*names, '', 'é' * 3000, '\x1b[2J'])),
+        value=ParameterValue(
+            type=kind,
+            bool_value=bool(rng.random() < 0.5),
+            integer_value=int(rng.choice([-(2**63), 0, 50, 2**63 - 1])),
+            double_value=float(rng.choice([np.nan, np.inf, -1e300, 50.0])),
+            string_value=str(rng.choice(['', 'gpu', '\n', 'é' * 3000])),
+            double_array_value=[50.0] * int(rng.integers(3)),
+        ),
+    )
+
+
+def wrong_time(rng):
+    """Time of a clock, mostly negative or too large."""
+    time = Clock()
+    time.clock.sec = int(rng.choice([-(2**31), -5, -1, 0, 2**31 - 1]))
+    time.clock.nanosec = int(rng.choice([0, 10**9, 2**32 - 1]))
+    return time
+
+
+def send(number, node, link, clock):
+    """Send a hostile cloud, parameters and time; after ten, a valid cloud must be answered."""
+    rng = np.random.default_rng([17, number])
+    cloud = hostile_cloud(rng) if rng.random() < 0.5 else damaged_message(rng)
+    link.publisher.publish(cloud)
+    clock.publish(wrong_time(rng))
+    for setter in SETTERS:
+        link.request(setter, [hostile_parameter(rng, number % 256)])
+    if number % 10 != 9:
+        return None
+    seen = len(link.ground.messages)
+    link.publish_until(
+        to_message(street(2000)),
+        lambda: any(m.width for m in link.ground.messages[seen:]),
+        'answer to a valid cloud',
+    )
+    memory = int(Path(f'/proc/{node.popen.pid}/statm').read_text().split()[1]) * 4096
+    if memory > MAX_RSS:
+        return f'the node holds {memory / 1e6:.0f} MB'
+    _, mark, trace = node.log.partition('Traceback')
+    return f'{mark}{trace[:500]}'.replace('\n', ' | ')
+
+
+@contextlib.contextmanager
+def case_of(part):
+    """What runs a case of a part by its number, and returns or raises what is wrong."""
+    if part in ('clouds', 'allocator'):
+        warnings.simplefilter('error')
+        yield try_cloud
+        return
+    with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
+        if part == 'files':
+            samples = make_samples(Path(name))
+            yield lambda number: try_file(number, samples, Path(name))
+            return
+        words = '-p', 'use_sim_time:=true'
+        node, link = stack.enter_context(linked_process(Path(name), *words))
+        node.wait_until_settled()
+        clock = link.probe.create_publisher(Clock, '/clock', 1)
+        yield lambda number: send(number, node, link, clock)
+
+
+def run_cases(part, first, stop):
+    """Print a line for each case that fails; the last number is that of the case at work."""
+    n_failed = 0
+    with case_of(part) as run_case:
+        for number in range(first, stop):
+            print(f'\r{number}', end='', flush=True)
+            try:
+                wrong = run_case(number)
+            except Exception as error:
+                wrong = f'{type(error).__name__}: {error}'
+            if wrong:
+                n_failed += 1
+                print(f'\rcase {number}: {wrong}', flush=True)
+    sys.exit(1 if n_failed else 0)
+
+
+def run_apart(part, first, stop):
+    """Run cases in a process of their own; return the lines of those that failed."""
+    environment = {**os.environ, **(DEBUGGING if part == 'allocator' else {})}
+    environment['PYTHONPATH'] = os.pathsep.join([str(TEST.parent), str(TEST)])
+    words = [sys.executable, __file__, part, str(first), str(stop)]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, errors='replace',
+                              env=environment, timeout=TIMEOUT, check=False)  # fmt: skip
     except subprocess.TimeoutExpired as error:
-        last = (error.stdout or b'')[-200:].decode(errors='replace').split('\r')[-1]
-        return [f'no end within {part.timeout:.0f} s, at case {last}']
+        return [f'{part}: no end within {TIMEOUT:.0f} s: {error.stdout or b""!r}'[-200:]]
     lines = [line.split('\r')[-1] for line in done.stdout.split('\n')]
-    failed = [line for line in lines if ': ' in line]
-    if done.returncode not in (0, 1) or (done.returncode == 1 and not failed):
-        failed.append(f'status {done.returncode} at case {lines[-1]}: {done.stderr[-300:]}')
+    failed = [f'{part}: {line}' for line in lines if ': ' in line]
+    if done.returncode != bool(failed):
+        failed.append(f'{part}: status {done.returncode} at {lines[-1]}: {done.stderr[-300:]}')
     return failed
 
 
 def main():
-    """Run what the state file does not hold yet."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument('--scale', type=float, default=float(os.environ.get('TORTURE_SCALE', '1')))
-    parser.add_argument('--state', type=Path, default=Path('build/torture.jsonl'))
-    parser.add_argument('--part', choices=PARTS, action='append')
-    options = parser.parse_args()
-    options.state.parent.mkdir(parents=True, exist_ok=True)
-    commit = git('rev-parse', '--short', 'HEAD')
-    code = {
-        name: hashlib.sha1(git('ls-tree', 'HEAD', *part.sources).encode()).hexdigest()[:10]
-        for name, part in PARTS.items()
-    }
-    done = {}
-    if options.state.exists():
-        for line in options.state.read_text().splitlines():
-            entry = json.loads(line)
-            if entry.get('code') == code.get(entry['part']):
-                done[entry['part'], entry['first'], entry['stop']] = entry
-
-    def run(name, first, stop):
-        started = time.monotonic()
-        failed = run_chunk(PARTS[name], first, stop)
-        seconds = time.monotonic() - started
-        entry = {
-            'commit': commit, 'code': code[name], 'part': name, 'first': first, 'stop': stop,
-            'failed': failed, 'seconds': round(seconds, 1),
-        }  # fmt: skip
-        with options.state.open('a') as file:
-            file.write(json.dumps(entry) + '\n')
-        for line in failed:
-            print(f'{name}: {line}', flush=True)
-        done[name, first, stop] = entry
-
-    names = options.part or list(PARTS)
-    wanted = []
-    for name in names:
-        part = PARTS[name]
-        n_cases = max(1, round(part.n_cases * options.scale))
-        starts = range(0, n_cases, part.chunk)
-        wanted += [(name, first, min(first + part.chunk, n_cases)) for first in starts]
-    with ThreadPoolExecutor(max(1, len(os.sched_getaffinity(0)))) as pool:
-        list(pool.map(lambda chunk: run(*chunk), [c for c in wanted if c not in done]))
-    n_failed = 0
-    print(f'\ncommit {commit}, {time.strftime("%Y-%m-%d")}, scale {options.scale:g}')
-    for name in names:
-        entries = [done[chunk] for chunk in wanted if chunk[0] == name]
-        failures = sum(len(entry['failed']) for entry in entries)
-        n_failed += failures
-        cases = sum(entry['stop'] - entry['first'] for entry in entries)
-        seconds = sum(entry['seconds'] for entry in entries)
-        others = sorted({entry['commit'] for entry in entries} - {commit})
-        where = f' (same code: {", ".join(others)})' if others else ''
-        print(f'{name:40} {cases:8} cases {seconds:8.0f} s {failures:4} failures{where}')
-    sys.exit(1 if n_failed else 0)
+    """Run all parts, and print the record."""
+    scale, failures = float(os.environ.get('TORTURE_SCALE', '1')), 0
+    for part, (n_cases, n_of_process) in PARTS.items():
+        stop, started = max(1, round(n_cases * scale)), time.monotonic()
+        starts = range(0, stop, n_of_process)
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            runs = [pool.submit(run_apart, part, k, min(k + n_of_process, stop)) for k in starts]
+            failed = [line for run in runs for line in run.result()]
+        took = time.monotonic() - started
+        print(*failed, f'{part:10}{stop:8} cases {took:7.0f} s {len(failed):4} failures', sep='\n')
+        failures += len(failed)
+    sys.exit(1 if failures else 0)
 
 
 if __name__ == '__main__':
-    main()
+    if len(sys.argv) == 1:
+        main()
+    run_cases(sys.argv[1], *map(int, sys.argv[2:]))
