@@ -201,9 +201,8 @@ def test_reflections_are_mirror_images():
     assert len(dry.points) == len(result.points)
 
 
-@pytest.mark.parametrize(('roll', 'pitch'), [(0.05, 0.0), (0.0, -0.08), (-0.1, 0.12)])
-def test_tilted_sensor_sees_the_same_world(roll, pitch, scene):
-    sensor = replace(EXACT, n_columns=60, roll=roll, pitch=pitch)
+def test_tilted_sensor_sees_the_same_world(scene):
+    sensor = replace(EXACT, n_columns=60, roll=-0.1, pitch=0.12)
     result = simulated(scene, sensor)
     returns = result.points[:, :3].astype(float)
     feet = np.column_stack([returns[:, :2], result.ground_z])
@@ -233,8 +232,7 @@ def test_a_vehicle_that_leans_sees_a_slope_as_level_ground(heading):
     np.testing.assert_allclose(made.points[:, :3], on_flat[:, :3], atol=1e-4)
 
 
-@pytest.mark.parametrize('name', ['hills', 'on_ramp'])
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize(('name', 'seed'), [('hills', 0), ('on_ramp', 1)])
 def test_the_scenes_of_a_leaning_vehicle_tilt_it_with_the_ground(name, seed):
     made, terrain = simulated(name, EXACT, seed), scene_of(name, seed).terrain
     x, y = np.random.default_rng(0).uniform(-1.2, 1.2, (2, 500))
