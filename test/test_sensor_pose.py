@@ -84,7 +84,7 @@ def test_rotated_points_keep_their_precision_and_stay_finite(dtype):
     assert list(np.isfinite(turned).all(axis=1)) == [True, True, False]
 
 
-@settings(max_examples=fewer(40, 5))
+@settings(max_examples=fewer(8, 3))
 @given(st.integers(0, 2**32 - 1), st.floats(0.3, 4.0), TILTS, TILTS, st.floats(-np.pi, np.pi))
 def test_a_cluttered_plane_is_recovered(seed, height, roll, pitch, yaw):
     points = cluttered_plane(seed, height, roll, pitch)
@@ -407,12 +407,17 @@ def test_angles_that_are_given_are_accepted():
     assert line.startswith('z does not point up: ')
 
 
-@SENSORS
-@pytest.mark.parametrize('scene', SCENES)
-@pytest.mark.parametrize(
-    'height', [1.73, *(pytest.param(height, marks=SLOW) for height in (0.4, 1.2, 2.5))]
-)
-def test_simulated_mounts_are_found_and_none_is_refused(sensor, scene, height):
+MOUNTS = [
+    # Each scene once by each sensor; the others in the long run.
+    pytest.param(scene, sensor, height, marks=[] if (i + j) % 3 == 0 and height == 1.73 else SLOW)
+    for i, scene in enumerate(SCENES)
+    for j, sensor in enumerate((SMALL_HDL, SMALL_VLP, SMALL_OS1))
+    for height in (0.4, 1.73)
+]
+
+
+@pytest.mark.parametrize(('scene', 'sensor', 'height'), MOUNTS)
+def test_simulated_mounts_are_found_and_none_is_refused(scene, sensor, height):
     pose = pose_of(scan_of(scene, sensor, height, seed=3).points)
     # On a wet road many lowest returns are mirror images: it may be assumed, with a warning.
     assert pose.height_estimated or scene == 'wet_road'
@@ -439,7 +444,7 @@ def test_steep_ground_is_not_refused(gradient):
 def test_real_frames(kitti):
     """The sensor is 1.73 m high; camber and verges move the plane by less than 0.15 m."""
     for sequence in list_sequences(kitti):
-        for frame in list_frames(kitti, sequence)[::3]:
+        for frame in list_frames(kitti, sequence)[::6]:
             points = read_points(frame.points_path)
             pose = pose_of(points)
             assert pose.height_estimated
