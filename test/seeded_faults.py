@@ -173,7 +173,7 @@ class Finder:
 
 
 def run(fault, tests, copy):
-    """Return the test that finds the fault; None if none does."""
+    """Return the test that finds the fault; None if none does, 'undecided' at the time limit."""
     path = copy / fault['file']
     source, old = path.read_bytes(), fault['old'].encode()
     at = source.find(fault['text'].encode()) + fault['at']
@@ -202,7 +202,7 @@ def run(fault, tests, copy):
         os.killpg(pid, signal.SIGKILL)
     path.write_bytes(source)
     if end == math.inf:
-        return None
+        return 'undecided'
     return (answer.read_text() or None) if answer.exists() else 'the tests ended'
 
 
