@@ -13,13 +13,13 @@ from gp_ground_seg.lab.scale.cluster import HERE, Runner
 from gp_ground_seg.lab.scoring.comparison import (
     INTERVAL,
     RMSE,
-    Measure,
     interval_note,
     interval_text,
     iou_measure,
 )
 from gp_ground_seg.lab.scoring.evaluate import Method, title_of
 from gp_ground_seg.lab.scoring.frames import Scores, sums
+from gp_ground_seg.lab.scoring.metrics import Measure
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import (
     Column,

@@ -10,15 +10,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy.special
 
 from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.lab.scoring.evaluate import title_of
-from gp_ground_seg.lab.scoring.frames import KEYS, Scores, require_pandas, sums
-from gp_ground_seg.lab.scoring.metrics import label_ratios, ratio
+from gp_ground_seg.lab.scoring.frames import KEYS, Scores, sums
+from gp_ground_seg.lab.scoring.metrics import (
+    HEIGHT_MEASURES,
+    LABEL_MEASURES,
+    Measure,
+    ratio,
+)
 from gp_ground_seg.lab.scoring.objects import SHARES
 from gp_ground_seg.lab.scoring.report import Column, Table, centimetres, milliseconds, percent
 
@@ -34,20 +39,6 @@ N_NAMED = 3
 """Frames that are named because they differ most."""
 INTERVAL = Column('95 % interval', key='interval')
 """Column of `interval_text`."""
-
-
-class Measure(NamedTuple):
-    """A ratio of sums, each of some columns of a frame, or the root of it."""
-
-    above: tuple[str, ...]
-    below: tuple[str, ...]
-    is_root: bool = False
-
-    def of(self, found: DataFrame) -> Any:
-        """Return the ratio of each row."""
-        above, below = (found[[*names]].sum(axis='columns') for names in self[:2])
-        value = ratio(above, below)
-        return np.sqrt(value) if self.is_root else value
 
 
 class Interval(NamedTuple):
@@ -69,11 +60,10 @@ class Interval(NamedTuple):
 
 def iou_measure(convention: str = '') -> Measure:
     """Return the IoU in a convention; without one, in columns that are of one only."""
-    tp, fp, fn = (f'{convention}_{name}'.lstrip('_') for name in ('tp', 'fp', 'fn'))
-    return Measure((tp,), (tp, fp, fn))
+    return LABEL_MEASURES['iou'].within(f'{convention}_' if convention else '')
 
 
-RMSE = Measure(('square',), ('n_points',), is_root=True)
+RMSE = HEIGHT_MEASURES['rmse']
 
 
 def clusters(scores: Scores) -> DataFrame:
@@ -93,29 +83,26 @@ def difference_interval(
     other: str,
     measure: Measure,
     frame: DataFrame | None = None,
-    rng: np.random.Generator | None = None,
     ours: str = '',
 ) -> Interval | None:
     """Interval of a measure of ours, by default the first method, minus that of another.
 
     It is of the pooled scans, or of the rows of another `frame` of the scores. None with fewer
-    than two clusters, or where a ratio is over nothing. `rng` draws; by default in the same way
-    each time.
+    than two clusters, or where a ratio is over nothing. It draws in the same way each time.
     """
     of_scan = clusters(scores)
     names = of_scan['cluster'].unique()
     n = len(names)
     if n < 2:
         return None
-    rng = np.random.default_rng(SEED) if rng is None else rng
-    times_drawn = rng.multinomial(n, np.full(n, 1.0 / n), size=N_DRAWS)
+    times_drawn = np.random.default_rng(SEED).multinomial(n, np.full(n, 1.0 / n), size=N_DRAWS)
     needed = [*dict.fromkeys([*measure.above, *measure.below])]
     rows = (scores.scans if frame is None else frame)[[*KEYS, *needed]]
     parts = sums(rows.merge(of_scan, on=[*KEYS[1:]]), 'cluster')
 
     def drawn(method: str) -> FloatArray:
         part = parts.loc[method].reindex(names, fill_value=0)[needed].to_numpy(dtype=np.float64)
-        pooled = require_pandas().DataFrame(times_drawn @ part, columns=needed)
+        pooled = dict(zip(needed, (times_drawn @ part).T, strict=True))
         return np.asarray(measure.of(pooled))
 
     difference = drawn(ours or scores.methods[0]) - drawn(other)
@@ -133,7 +120,7 @@ def interval_text(
     ours: str = '',
 ) -> str | None:
     """`difference_interval` in percent or cm; None without one."""
-    found = difference_interval(scores, other, measure, frame, ours=ours)
+    found = difference_interval(scores, other, measure, frame, ours)
     return None if found is None else found.text(percent(''))
 
 
@@ -154,13 +141,12 @@ def without_one_table(scores: Scores, other: str) -> Table:
     The interval is a jackknife-t: wider than the bootstrap's, and the more honest with six
     sequences (Efron and Tibshirani, 1993, chapter 11).
     """
-    names = scores.sequences
+    names, iou = scores.sequences, iou_measure(scores.conventions[0])
     parts = sums(scores.scans, 'sequence')
     ours, peer = (
-        label_ratios(own.sum() - own.reindex([*names, NONE], fill_value=0),
-                     f'{scores.conventions[0]}_')['iou']
+        iou.of(own.sum() - own.reindex([*names, NONE], fill_value=0))
         for own in (parts.loc[method] for method in (scores.methods[0], other))
-    )  # fmt: skip
+    )
     difference = ours - peer
     n, whole = len(names), float(difference[NONE])
     reach = math.sqrt((n - 1) ** 2 / n * difference[names].var())
@@ -180,11 +166,12 @@ def without_one_table(scores: Scores, other: str) -> Table:
 
 def measures(convention: str) -> dict[Column, Measure]:
     """Return what is compared by `difference_table`, in the convention that counts."""
-    tp, fp, fn = (f'{convention}_{name}' for name in ('tp', 'fp', 'fn'))
+    titles = {'IoU [%]': 'iou', 'precision [%]': 'precision', 'recall [%]': 'recall'}
     return {
-        percent('IoU [%]'): iou_measure(convention),
-        percent('precision [%]'): Measure((tp,), (tp, fp)),
-        percent('recall [%]'): Measure((tp,), (tp, fn)),
+        **{
+            percent(title): LABEL_MEASURES[name].within(f'{convention}_')
+            for title, name in titles.items()
+        },
         percent('returns on objects called ground [%]'): Measure(('n_ground',), ('n_returns',)),
         percent('objects lost [%]'): Measure(('n_lost',), ('n_objects',)),
         **{
@@ -192,12 +179,10 @@ def measures(convention: str) -> dict[Column, Measure]:
             for name, title in SHARES.items()
         },
         centimetres('RMSE of the height [cm]'): RMSE,
-        percent('heights within 1 std, ideally 68.3 [%]'):
-            Measure(('n_within_1',), ('n_with_std',)),
-        percent('heights within 2 std, ideally 95.4 [%]'):
-            Measure(('n_within_2',), ('n_with_std',)),
+        percent('heights within 1 std, ideally 68.3 [%]'): HEIGHT_MEASURES['within_1'],
+        percent('heights within 2 std, ideally 95.4 [%]'): HEIGHT_MEASURES['within_2'],
         milliseconds('time per frame, mean [ms]'): Measure(('seconds',), ('n_scans',)),
-    }  # fmt: skip
+    }
 
 
 def difference_table(scores: Scores, other: str) -> Table:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 from typing import Any, Protocol
@@ -17,8 +17,7 @@ from gp_ground_seg.core.backend import Backend, make_backend
 from gp_ground_seg.core.errors import DataError, PointCloudError, shown
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
 from gp_ground_seg.core.parameters.config import Config, RuntimeConfig
-from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
-from gp_ground_seg.core.result import FitReport
+from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import Frame, read_entries, read_points
 from gp_ground_seg.lab.scale.cluster import HERE, Progress, Runner
@@ -39,27 +38,22 @@ OURS = 'gp_ground_seg'
 PATCHWORKPP = 'patchworkpp'
 TITLES = {PATCHWORKPP: 'Patchwork++'}
 """Names of methods in tables, where they differ from those in files."""
-STATE = (
-    'status', 'n_evaluations', 'n_segments',
-    'sensor_height', 'sensor_height_estimated', 'sensor_roll', 'sensor_pitch',
-)  # fmt: skip
-"""What is reported of a scan of our method; angles in radians."""
+FIT = ('mode', 'status', 'n_evaluations', 'n_segments', 'n_pseudo_inputs', 'backend')
+POSE = ('height', 'height_estimated', 'roll', 'pitch')
+"""What is reported of the learning and of the sensor in a scan of ours; angles in radians."""
 Points = npt.NDArray[np.floating]
 
 
 @dataclass(frozen=True)
 class MethodResult:
-    """Labels of a scan of N points, and the surface under it."""
+    """Labels of a scan of N points, and the surface under it.
+
+    Its names, and more of them, are those of our `Segmentation`.
+    """
 
     label: Labels  # (N,)
     ground_z: FloatArray  # (N,) height of the ground under each point [m]; NaN = no model
     p_ground: npt.NDArray[np.floating] | None = None  # (N,), where the method has probabilities
-    return_std: FloatArray | None = None  # (N,) of a ground return about `ground_z` [m]
-    ground_std: FloatArray | None = None  # (N,) of the ground about `ground_z` [m]
-    stages: dict[str, float] = field(default_factory=dict)  # seconds
-    pose: SensorPose | None = None
-    fit: FitReport | None = None
-    height: FloatArray | None = None  # (N,) over the surface, where the method has one [m]
 
 
 class Method(Protocol):
@@ -74,7 +68,7 @@ class Method(Protocol):
     def run(self, points: Points) -> None:
         """Segment a scan of (N, 4) x, y, z, intensity: the part that is timed."""
 
-    def result(self) -> MethodResult:
+    def result(self) -> MethodResult | Segmentation:
         """Return the result of the last scan."""
 
 
@@ -103,14 +97,9 @@ class OurMethod:
         """Segment a scan."""
         self.last = self._segmenter.segment(points)
 
-    def result(self) -> MethodResult:
+    def result(self) -> Segmentation:
         """Return the result of the last scan."""
-        last = self.last
-        stages = {stage: s for stage, s in last.timings.items() if stage != 'total'}
-        return MethodResult(
-            last.label, last.ground_z, last.p_ground, last.return_std, last.ground_std,
-            stages, last.pose, last.fit, last.height,
-        )  # fmt: skip
+        return self.last
 
 
 @dataclass(frozen=True)
@@ -127,7 +116,7 @@ class KnownScan:
     is_ground: BoolArray | None = None  # (N,) points under which the surface is compared with it
     objects: Objects | None = None  # what stands on the ground, if known
     std: str = 'return_std'
-    """Field of `MethodResult` that the errors of the height are compared with: heights of ground
+    """Field of `Segmentation` that the errors of the height are compared with: heights of ground
     returns scatter by `return_std`, exact heights by `ground_std`."""
     cluster: str = ''  # scans that the bootstrap draws together; by default the sequence
     cut: CutScan | None = None  # what of it is segmented once more, to count low things
@@ -201,9 +190,7 @@ def _score_block(
         scan = load(item)
         if k == 0:
             # What a method learns from cut scans it must not know in the whole ones.
-            copies = (
-                [copy.copy(method) for method in methods] if scan.cut else [None] * len(methods)
-            )
+            copies = [copy.copy(method) for method in methods]
             for method in methods:
                 _run(method, scan)
         forgets = each_alone or scan.sequence != sequence
@@ -236,9 +223,9 @@ def _run(method: Method, scan: KnownScan) -> None:
         raise PointCloudError(f'{scan.sequence}/{scan.index}: {method.name}: {error}') from error
 
 
-def _low_things(scan: KnownScan, method: Method | None, *, forgets: bool) -> dict[str, int]:
+def _low_things(scan: KnownScan, method: Method, *, forgets: bool) -> dict[str, int]:
     """Run a method on what is left of a cut scan, and count the low things called ground."""
-    if scan.cut is None or method is None:
+    if scan.cut is None:
         return {}
     if forgets:
         method.reset()
@@ -246,7 +233,7 @@ def _low_things(scan: KnownScan, method: Method | None, *, forgets: bool) -> dic
     return scan.cut.count(method.result().label)
 
 
-def _score(scan: KnownScan, result: MethodResult) -> Rows:
+def _score(scan: KnownScan, result: MethodResult | Segmentation) -> Rows:
     """Rows of a scan, by frame."""
     label, rows = result.label, Rows()
     sums: dict[str, Any] = {'cluster': scan.cluster or scan.sequence, 'n_scans': 1}
@@ -259,27 +246,17 @@ def _score(scan: KnownScan, result: MethodResult) -> Rows:
         if result.p_ground is not None:
             rows['bins'] = metrics.count_bins(result.p_ground, truth)
     if scan.ground_z is not None and scan.is_ground is not None:
-        ground, std = scan.is_ground, getattr(result, scan.std)
+        ground, std = scan.is_ground, getattr(result, scan.std, None)
         sums |= metrics.height_sums(
             scan.ground_z[ground], result.ground_z[ground], None if std is None else std[ground]
         )
     if scan.objects is not None:
         rows['objects'] = count_objects(scan.points, label, scan.objects)
         sums |= {name: sum(row[name] for row in rows['objects']) for name in OBJECT_COUNTS}
-    if scan.semantic is not None and result.height is not None:
-        sums |= count_false_cells(scan.points, label, result.height, scan.semantic)
-    if result.fit is not None and result.pose is not None:
-        sums |= _state(result.fit, result.pose)
-    if result.stages:
-        rows['times'] = [dict(result.stages)]
+    if isinstance(result, Segmentation):
+        if scan.semantic is not None:
+            sums |= count_false_cells(scan.points, label, result.height, scan.semantic)
+        sums |= {name: getattr(result.fit, name) for name in FIT}
+        sums |= {f'sensor_{name}': getattr(result.pose, name) for name in POSE}
+        rows['times'] = [{k: s for k, s in result.timings.items() if k != 'total'}]
     return {'scans': [sums], **rows}
-
-
-def _state(fit: FitReport, pose: SensorPose) -> dict[str, Any]:
-    """State of the learning and pose of the sensor, of our method; angles in radians."""
-    values = (
-        fit.status, fit.n_evaluations, fit.n_segments,
-        pose.height, pose.height_estimated, pose.roll, pose.pitch,
-    )  # fmt: skip
-    more = {'mode': fit.mode, 'backend': fit.backend, 'n_pseudo_inputs': fit.n_pseudo_inputs}
-    return dict(zip(STATE, values, strict=True)) | more

@@ -83,23 +83,17 @@ class Scores(NamedTuple):
 
 def make_scores(parts: Iterable[Rows]) -> Scores:
     """Make frames of rows, in the order of the methods."""
-    pandas, together = require_pandas(), Rows()
-    for part in parts:
-        for name, rows in part.items():
-            together.setdefault(name, []).extend(rows)
-    place: dict[str, int] = {}
-    for row in together['scans']:
-        place.setdefault(row['method'], len(place))
-    ordered = {
-        name: sorted(together.get(name, ()), key=lambda row: place[row['method']])
-        for name in COLUMNS
-    }
+    pandas, parts = require_pandas(), [*parts]
+    rows = {name: [row for part in parts for row in part.get(name, ())] for name in COLUMNS}
+    methods = list(dict.fromkeys(row['method'] for row in rows['scans']))
+    for own in rows.values():
+        own.sort(key=lambda row: methods.index(row['method']))
     frames = (
         # Without a row pandas knows no type, and sums up no column.
-        pandas.DataFrame(rows) if rows else pandas.DataFrame(columns=[*COLUMNS[name]], dtype=float)
-        for name, rows in ordered.items()
+        pandas.DataFrame(own) if own else pandas.DataFrame(columns=[*COLUMNS[name]], dtype=float)
+        for name, own in rows.items()
     )
-    return Scores(ordered, *frames)
+    return Scores(rows, *frames)
 
 
 def require_pandas() -> Any:

@@ -1,6 +1,6 @@
 """Conventions of ground; labels, probabilities and heights against the truth, as sums.
 
-Sums add up over scans. The ratios are functions of sums by name: of one scan, or of a frame of
+Sums add up over scans. A `Measure` is a ratio of sums by name: of one scan, or of a frame of
 pandas, whose rows are scans or groups of them. Ratios over nothing are NaN.
 """
 
@@ -10,13 +10,13 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.frame import FloatArray, IntArray, Label
+from gp_ground_seg.core.frame import IntArray, Label
 from gp_ground_seg.data.semantic_kitti import GROUND_CLASSES, OUTLIER, UNLABELLED, VEGETATION
 
 Labels = npt.NDArray[np.uint8]
@@ -95,16 +95,55 @@ def ratio(part: Any, whole: Any) -> Any:
         return np.true_divide(part * (whole != 0), whole)
 
 
+class Measure(NamedTuple):
+    """A ratio of two sums, each of some columns, or the root of it."""
+
+    above: tuple[str, ...]
+    below: tuple[str, ...]
+    is_root: bool = False
+
+    def of(self, sums: Any) -> Any:
+        """Return it of sums by name: of numbers, or of the rows of a frame."""
+        value = ratio(*(sum(sums[name] for name in names) for names in self[:2]))
+        return np.sqrt(value) if self.is_root else value
+
+    def within(self, prefix: str) -> Measure:
+        """Return it of columns whose names have a prefix."""
+        above, below = (tuple(f'{prefix}{name}' for name in names) for names in self[:2])
+        return Measure(above, below, self.is_root)
+
+
+LABEL_MEASURES = {
+    'precision': Measure(('tp',), ('tp', 'fp')),
+    'recall': Measure(('tp',), ('tp', 'fn')),
+    'f1': Measure(('tp', 'tp'), ('tp', 'tp', 'fp', 'fn')),
+    'accuracy': Measure(('tp', 'tn'), COUNTS),
+    'iou': Measure(('tp',), ('tp', 'fp', 'fn')),
+}
+"""Measures of `COUNTS`."""
+HEIGHT_MEASURES = {
+    'rmse': Measure(('square',), ('n_points',), is_root=True),
+    'bias': Measure(('error',), ('n_points',)),
+    'smse': Measure(('square',), ('deviation',)),
+    'within_1': Measure(('n_within_1',), ('n_with_std',)),
+    'within_2': Measure(('n_within_2',), ('n_with_std',)),
+}
+"""Measures of `height_sums`; lengths in metres.
+
+RMSE; bias, the mean error; the standardised mean squared error, mean((y - mu)^2) / var(y)
+(paper, section IV); the shares within one and two standard deviations, of a normal distribution
+0.683 and 0.954.
+"""
+
+
 def label_ratios(sums: Any, prefix: str = '') -> dict[str, Any]:
-    """Return the ratios of `COUNTS`, whose names have the `prefix`, by name."""
-    tp, fp, fn, tn = (sums[f'{prefix}{name}'] for name in COUNTS)
-    return {
-        'precision': ratio(tp, tp + fp),
-        'recall': ratio(tp, tp + fn),
-        'f1': ratio(2 * tp, 2 * tp + fp + fn),
-        'accuracy': ratio(tp + tn, tp + fp + fn + tn),
-        'iou': ratio(tp, tp + fp + fn),
-    }
+    """Return `LABEL_MEASURES` of sums whose names have the `prefix`, by name."""
+    return {name: measure.within(prefix).of(sums) for name, measure in LABEL_MEASURES.items()}
+
+
+def height_ratios(sums: Any) -> dict[str, Any]:
+    """Return `HEIGHT_MEASURES` of sums, by name."""
+    return {name: measure.of(sums) for name, measure in HEIGHT_MEASURES.items()}
 
 
 def count_labels(label: Labels, truth: Labels) -> dict[str, int]:
@@ -191,14 +230,6 @@ def calibration_error(sums: Any) -> float:
     return float(ratio((sums['n_ground'] - sums['p']).abs().sum(), sums['n'].sum()))
 
 
-FINEST_STD = 1e-3
-"""Least standard deviation in the predictive density [m]: no sensor resolves a millimetre, and the
-density of a handful of returns that happen to agree would outweigh all others."""
-TRIMMED = 1e-3
-"""Share of the points of a frame that the mean negative log density leaves out, those with the
-lowest density: five returns that lie metres below the ground would decide it."""
-
-
 def height_sums(
     truth: npt.NDArray[np.floating],
     estimate: npt.NDArray[np.floating],
@@ -214,8 +245,6 @@ def height_sums(
     y = truth[known].astype(np.float64)
     error = estimate[known] - y
     spread = np.full(len(y), np.nan) if std is None else std[known]
-    nlpd = negative_log_density(error, spread)
-    counts = nlpd <= largest_nlpd(nlpd)
     return {
         'n_points': len(y),
         'n_without_model': len(truth) - len(y),
@@ -226,39 +255,5 @@ def height_sums(
         'n_with_std': int(np.isfinite(spread).sum()),
         'n_within_1': int((np.abs(error) <= spread).sum()),
         'n_within_2': int((np.abs(error) <= 2.0 * spread).sum()),
-        'sum_nlpd': float(nlpd[counts].sum()),
-        'n_nlpd': int(counts.sum()),
         'median_absolute': float(np.median(np.abs(error))) if len(y) else math.nan,
     }
-
-
-def height_ratios(sums: Any) -> dict[str, Any]:
-    """Return the ratios of `height_sums`, by name; lengths in metres.
-
-    RMSE; bias, the mean error; the standardised mean squared error, mean((y - mu)^2) / var(y)
-    (paper, section IV); the shares within one and two standard deviations, of a normal
-    distribution 0.683 and 0.954; the mean negative log predictive density (Rasmussen and
-    Williams, 2006, section 2.5) without the worst `TRIMMED` of each frame.
-    """
-    n = sums['n_points']
-    return {
-        'rmse': np.sqrt(ratio(sums['square'], n)),
-        'bias': ratio(sums['error'], n),
-        'smse': ratio(sums['square'], sums['deviation']),
-        'within_1': ratio(sums['n_within_1'], sums['n_with_std']),
-        'within_2': ratio(sums['n_within_2'], sums['n_with_std']),
-        'nlpd': ratio(sums['sum_nlpd'], sums['n_nlpd']),
-    }
-
-
-def negative_log_density(error: FloatArray, std: FloatArray) -> FloatArray:
-    """Negative log of the normal density of errors, (n,) [m]; NaN where `std` is."""
-    fine = np.maximum(std, FINEST_STD)
-    result: FloatArray = 0.5 * np.log(2.0 * np.pi * fine**2) + 0.5 * (error / fine) ** 2
-    return result
-
-
-def largest_nlpd(nlpd: FloatArray) -> float:
-    """Return the largest one that is not among the worst `TRIMMED` of a frame, (n,)."""
-    known = np.sort(nlpd[~np.isnan(nlpd)])
-    return float(known[-1 - int(TRIMMED * len(known))]) if len(known) else math.inf

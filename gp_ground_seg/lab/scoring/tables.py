@@ -9,16 +9,16 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.lab.scoring import metrics, report
 from gp_ground_seg.lab.scoring.comparison import (
     INTERVAL,
-    Measure,
     difference_table,
     interval_note,
     interval_text,
     iou_measure,
     without_one_table,
 )
-from gp_ground_seg.lab.scoring.evaluate import STATE, title_of
+from gp_ground_seg.lab.scoring.evaluate import FIT, POSE, title_of
 from gp_ground_seg.lab.scoring.frames import ALL, KEYS, Scores, each, sums, with_all
 from gp_ground_seg.lab.scoring.metrics import (
+    Measure,
     calibration_error,
     height_ratios,
     label_ratios,
@@ -103,17 +103,18 @@ def scan_rows(scores: Scores) -> list[dict[str, Any]]:
     bins, objects = (
         dict(iter(frame.groupby([*KEYS], sort=False))) for frame in (scores.bins, scores.objects)
     )
+    heights = 'n_points', 'n_without_model', 'median_absolute'
+    kept = *KEYS, 'seconds', 'points', 'n_changed', *FIT, *(f'sensor_{name}' for name in POSE)
     rows = []
     for own in scores.rows['scans']:
         key = tuple(own[name] for name in KEYS)
-        row = {name: own[name] for name in (*KEYS, 'seconds', 'points', 'n_changed')}
+        row = {name: own[name] for name in kept if name in own}
         for convention in scores.conventions:
             counts = {name: own[f'{convention}_{name}'] for name in metrics.COUNTS}
             found = counts | label_ratios(counts)
             row |= {f'{convention}_{name}': value for name, value in found.items()}
         if own.get('n_points'):
-            names = 'n_points', 'n_without_model', 'median_absolute'
-            found = {name: own[name] for name in names} | height_ratios(own)
+            found = {name: own[name] for name in heights} | height_ratios(own)
             row |= {f'{name}_all': value for name, value in found.items()}
         if key in bins and bins[key]['n'].any():
             row['ece'] = calibration_error(bins[key])
@@ -121,17 +122,12 @@ def scan_rows(scores: Scores) -> list[dict[str, Any]]:
             if f'{name}_n' in own:
                 row[name] = {'n': own[f'{name}_n'], 'n_wrong': own[f'{name}_wrong']}
         if key in objects:
-            row['objects'] = _nested(objects[key])
-        rows.append(row | {name: own[name] for name in STATE if name in own})
+            row['objects'] = {
+                name: part.set_index('range')[[*OBJECT_COUNTS]].to_dict('index')
+                for name, part in objects[key].groupby('class', sort=False)
+            }
+        rows.append(row)
     return rows
-
-
-def _nested(objects: DataFrame) -> dict[str, dict[str, dict[str, int]]]:
-    """`OBJECT_COUNTS` of a scan by class and band."""
-    return {
-        name: own.set_index('range')[[*OBJECT_COUNTS]].to_dict('index')
-        for name, own in objects.groupby('class', sort=False)
-    }
 
 
 def _beside(found: list[Series], methods: list[str]) -> dict[Column, Any]:
@@ -207,32 +203,27 @@ def object_table(scores: Scores) -> Table:
     ]  # fmt: skip
     pooled = sums(rows, 'class', 'range')
     found = [pooled.loc[[(method, *place) for place in places]] for method in scores.methods]
-    ours, shares = found[0], [ratio(own['n_ground'], own['n_returns']) for own in found]
-    lost = [own['n_lost'].where(own['n_objects'] > 0) for own in found]
-    peers = scores.methods[1:]
     measure = Measure(('n_ground',), ('n_returns',))
-    parts = dict(iter(rows.groupby(['class', 'range'])))
+    lost = [own['n_lost'].where(own['n_objects'] > 0) for own in found]
     columns: dict[Column, Any] = {
         Column('class'): [name for name, _ in places],
         Column('range'): [band for _, band in places],
-        Column('returns', '_d'): ours['n_returns'],
-        percent('as ground', 'share_ground'): shares[0],
+        Column('returns', '_d'): found[0]['n_returns'],
+        percent('as ground', 'share_ground'): measure.of(found[0]),
     }
-    for peer, share in zip(peers, shares[1:], strict=True):
-        columns[percent('peer', f'{peer}_share_ground')] = share
-        columns[INTERVAL] = [
-            interval_text(scores, peer, measure, parts[place]) for place in places
-        ]
-    columns |= {Column('objects', '_d'): ours['n_objects'], Column('lost', '_d'): lost[0]}
-    for peer, own in zip(peers, lost[1:], strict=True):
-        columns[Column('peer lost', '_d', f'{peer}_lost')] = own
     title = (
         f'Objects: returns on them from {MIN_HEIGHT:g} m above the local ground, and the share '
         f'called ground [%]; objects with at least {MIN_RETURNS} such returns, and how many of '
         'them are lost: more than half of these returns called ground'
     )
-    if peers:
-        title += f'; peer: {title_of(peers[0])}; {interval_note(scores)}'
+    parts = dict(iter(rows.groupby(['class', 'range'])))
+    for peer, own in zip(scores.methods[1:], found[1:], strict=True):
+        columns[percent('peer', f'{peer}_share_ground')] = measure.of(own)
+        columns[INTERVAL] = [interval_text(scores, peer, measure, parts[k]) for k in places]
+        title += f'; peer: {title_of(peer)}; {interval_note(scores)}'
+    columns |= {Column('objects', '_d'): found[0]['n_objects'], Column('lost', '_d'): lost[0]}
+    for peer, count in zip(scores.methods[1:], lost[1:], strict=True):
+        columns[Column('peer lost', '_d', f'{peer}_lost')] = count
     return Table(columns, title, _object_notes(scores))
 
 
@@ -317,13 +308,14 @@ def _height_table(scores: Scores) -> Table:
     rows = with_all(scores.scans)
     ours, *others = each(sums(rows, 'sequence'), scores.methods)
     ratios = height_ratios(ours)
+    medians = rows.groupby(['method', 'sequence'], sort=False)['median_absolute'].median()
     columns = {
         Column('sequence'): ours.index,
         Column('points', '_d'): ours['n_points'],
         percent('no model', 'share_without_model'): share_without_model(ours),
         centimetres('bias'): ratios['bias'],
         centimetres('RMSE', 'rmse'): ratios['rmse'],
-        centimetres('median', 'median_absolute'): medians(rows, scores.methods[0]),
+        centimetres('median', 'median_absolute'): medians[scores.methods[0]],
         percent('in 1 std', 'within_1', '.1f'): ratios['within_1'],
         percent('in 2 std', 'within_2', '.1f'): ratios['within_2'],
         **{
@@ -336,12 +328,6 @@ def _height_table(scores: Scores) -> Table:
         'shares within one and two standard deviations  [%]'
     )
     return Table(columns, title, n_sums=1)
-
-
-def medians(scans: DataFrame, method: str) -> Series:
-    """Median over the frames of each sequence of the median absolute error [m]."""
-    own = scans[scans['method'] == method]
-    return own.groupby('sequence', sort=False)['median_absolute'].median()
 
 
 def share_without_model(found: DataFrame) -> Series:
