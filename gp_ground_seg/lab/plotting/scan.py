@@ -29,31 +29,6 @@ def new_figure(width: float, height: float, dpi: int = DPI) -> Any:
     return require('matplotlib.figure', 'matplotlib').Figure((width, height), dpi=dpi)
 
 
-def add_axes(figure: Any, left: float, bottom: float, size: tuple[float, float]) -> Any:
-    """Return new axes at a place from the lower left corner, width and height `size` [inch].
-
-    matplotlib's own layouts leave no room for a legend below equal axes.
-    """
-    width, height = figure.get_size_inches()
-    return figure.add_axes((left / width, bottom / height, size[0] / width, size[1] / height))
-
-
-def write_line(figure: Any, text: str, x: float, below_top: float, **style: Any) -> None:
-    """Write a line of text at a share of the width, `below_top` inches from the upper edge."""
-    y = 1.0 - below_top / figure.get_size_inches()[1]
-    figure.text(x, y, text, **{'ha': 'center', 'va': 'center', 'parse_math': False, **style})
-
-
-def legend_dots(colours: Mapping[str, str], size: float) -> list[Any]:
-    """Return legend entries; dots as small as in the picture would show no colour."""
-    from matplotlib.lines import Line2D
-
-    return [
-        Line2D([], [], marker='o', markersize=size, color=colour, linestyle='none', label=name)
-        for name, colour in colours.items()
-    ]
-
-
 def save(figure: Any, path: str | Path) -> None:
     """Write a figure as PDF or SVG where `path` ends so, else as PNG, replacing the file."""
     from matplotlib import rc_context
@@ -99,16 +74,22 @@ def plot_scan_view(
     xyz = check_points(points)
     check_lengths(len(xyz), label=label, truth=truth)
     said, layers = label_layers(label, truth)
-    figure = new_figure(WIDTH, FOOT + HEIGHT + (TITLE if title else 0.0))
-    write_line(figure, title, 0.5, 0.5 * TITLE, fontsize=14)
-    axes = add_axes(figure, 0.0, FOOT, (WIDTH, HEIGHT))
+    whole = FOOT + HEIGHT + (TITLE if title else 0.0)
+    figure = new_figure(WIDTH, whole)
+    figure.text(
+        0.5, 1.0 - 0.5 * TITLE / whole, title,
+        ha='center', va='center', parse_math=False, fontsize=14,
+    )  # fmt: skip
+    # matplotlib's own layouts leave no room for a legend below equal axes.
+    axes = figure.add_axes((0.0, FOOT / whole, 1.0, HEIGHT / whole))
     _draw_points(axes, xyz, layers, camera)
     axes.set_axis_off()
     axes.set_aspect('equal')
     axes.set_xlim(-0.5, 0.5)
     axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
-    dots = legend_dots({name: COLOURS[name] for name in layers}, 7)
-    figure.legend(handles=dots, loc='lower left', fontsize=11, frameon=False, ncols=4)
+    for name in layers:  # dots as small as in the picture would show no colour
+        axes.plot([], [], 'o', markersize=7, color=COLOURS[name], label=name)
+    figure.legend(loc='lower left', fontsize=11, frameon=False, ncols=4)
     save(figure, path)
     return said
 
