@@ -12,7 +12,7 @@ from PIL import Image
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.cli.demo import simulated_drive
 from gp_ground_seg.core.log import in_thousands
-from gp_ground_seg.lab.plotting.scan import plot_scan_view
+from gp_ground_seg.lab.plotting import plot_scan_view
 
 N_SCANS, PERIOD = 30, 100
 """Number of scans, and the time that each is shown [ms]: as fast as the drive."""

@@ -11,8 +11,7 @@ from conftest import REPOSITORY
 from matplotlib.image import imread
 
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.lab.viewers.page import LEGENDS, palette
-from gp_ground_seg.lab.viewers.tuner import tunable
+from gp_ground_seg.lab.tuner import LEGENDS, palette, tunable
 
 pytest.importorskip('viser', reason='viser is not installed')
 webdriver = pytest.importorskip('selenium.webdriver', reason='selenium is not installed')

@@ -16,7 +16,7 @@ from gp_ground_seg import GroundSegmenter, __version__
 from gp_ground_seg.cli import demo
 from gp_ground_seg.cli.main import COMMANDS, build_parser
 from gp_ground_seg.core.jit import JIT_ENABLED
-from gp_ground_seg.lab.plotting.scan import plot_scan_view
+from gp_ground_seg.lab.plotting import plot_scan_view
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
 
 figures = load_script('docs/figures.py')

@@ -15,8 +15,8 @@ from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.core.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.data import colours as colours_
 from gp_ground_seg.data.colours import COLOURS
-from gp_ground_seg.lab.plotting import scan
-from gp_ground_seg.lab.plotting.scan import (
+from gp_ground_seg.lab import plotting
+from gp_ground_seg.lab.plotting import (
     CAMERA,
     TARGET,
     ZOOM,
@@ -43,7 +43,7 @@ def repeat(values, n=4000):
 
 def where(path, colour):
     """Centre of the pixels of a colour in the scene, in widths right and up, and their number."""
-    scene = imread(path)[: -round(scan.FOOT * scan.DPI)]
+    scene = imread(path)[: -round(plotting.FOOT * plotting.DPI)]
     rows, columns = np.nonzero(close_to(scene, colour))
     if not len(rows):
         return None, 0
@@ -118,9 +118,9 @@ def test_bad_input_is_said(tmp_path, keywords, error, message):
 def test_matplotlib_is_optional_and_its_global_state_untouched(tmp_path, monkeypatch):
     script = (
         'import sys, numpy as np\n'
-        'from gp_ground_seg.lab.plotting import scan, segment\n'
+        'from gp_ground_seg.lab.plotting import plot_scan_view\n'
         'assert "matplotlib" not in sys.modules\n'
-        'scan.plot_scan_view(np.zeros((2, 3)), np.ones(2, np.uint8), sys.argv[1])\n'
+        'plot_scan_view(np.zeros((2, 3)), np.ones(2, np.uint8), sys.argv[1])\n'
         'assert "matplotlib" in sys.modules and "matplotlib.pyplot" not in sys.modules\n'
     )
     words = [sys.executable, '-c', script, str(tmp_path / 'a.png')]

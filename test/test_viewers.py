@@ -12,9 +12,16 @@ from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.lab.viewers import page
-from gp_ground_seg.lab.viewers.page import open_server, palette, point_colours, read_view
-from gp_ground_seg.lab.viewers.tuner import Tuner, slider_range, tunable
+from gp_ground_seg.lab import tuner as page
+from gp_ground_seg.lab.tuner import (
+    Tuner,
+    open_server,
+    palette,
+    point_colours,
+    read_view,
+    slider_range,
+    tunable,
+)
 
 CAR = 10 | 7 << 16  # class of SemanticKITTI, and an instance of it
 

@@ -25,7 +25,7 @@ from gp_ground_seg.data.point_cloud2 import (
     read_fields,
     read_xyz,
 )
-from gp_ground_seg.lab.plotting.scan import new_figure, plot_scan_view
+from gp_ground_seg.lab.plotting import new_figure, plot_scan_view
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_labels, label_ratios
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
 from gp_ground_seg.ros.node_process import GROUND, OBSTACLES, Link, NodeProcess, private_session

@@ -15,8 +15,14 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import read_labels
-from gp_ground_seg.lab.plotting.scan import CAMERA, Place, camera_at, plot_scan_view
-from gp_ground_seg.lab.plotting.segment import plot_segment, segment_at
+from gp_ground_seg.lab.plotting import (
+    CAMERA,
+    Place,
+    camera_at,
+    plot_scan_view,
+    plot_segment,
+    segment_at,
+)
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
 
 SCAN = """\

@@ -11,8 +11,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.export import to_yaml
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.data.atomic_output import check_writable, staged_file
-from gp_ground_seg.lab.viewers.page import open_server
-from gp_ground_seg.lab.viewers.tuner import Tuner, tunable
+from gp_ground_seg.lab.tuner import Tuner, open_server, tunable
 
 DESCRIPTION = """\
 Show a scan in the browser, with sliders for the parameters. Labels follow at once,

@@ -1,1 +1,0 @@
-"""A scan in the browser, with sliders for the parameters."""
