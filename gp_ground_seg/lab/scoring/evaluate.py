@@ -21,18 +21,10 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import Frame, read_entries, read_points
 from gp_ground_seg.lab.scale.cluster import HERE, Progress, Runner
-from gp_ground_seg.lab.scoring import metrics
+from gp_ground_seg.lab.scoring import metrics, objects
 from gp_ground_seg.lab.scoring.frames import Rows, Scores, make_scores, require_pandas
 from gp_ground_seg.lab.scoring.metrics import CONVENTIONS, GROUNDGRID, Labels
-from gp_ground_seg.lab.scoring.objects import (
-    OBJECT_COUNTS,
-    CutScan,
-    Objects,
-    count_false_cells,
-    count_objects,
-    cut_objects,
-    labelled_objects,
-)
+from gp_ground_seg.lab.scoring.objects import CutScan, Objects
 
 OURS = 'gp_ground_seg'
 PATCHWORKPP = 'patchworkpp'
@@ -140,10 +132,10 @@ def load_kitti(frame: Frame, cut: float = 0.0) -> KnownScan:
     z = points[:, 2].astype(np.float64)
     truths = {rule.key: rule.truth(semantic, points[:, 2]) for rule in CONVENTIONS}
     is_ground = truths[GROUNDGRID.key] == Label.GROUND
-    objects = labelled_objects(points, entries, is_ground)
+    found = objects.labelled_objects(points, entries, is_ground)
     names = shown(frame.sequence), shown(frame.index)
-    low = cut_objects(points, objects.class_of >= 0, is_ground, cut) if cut else None
-    return KnownScan(*names, points, truths, semantic, z, is_ground, objects, cut=low)
+    low = objects.cut_objects(points, found.class_of >= 0, is_ground, cut) if cut else None
+    return KnownScan(*names, points, truths, semantic, z, is_ground, found, cut=low)
 
 
 def as_it_is(scan: KnownScan) -> KnownScan:
@@ -251,11 +243,11 @@ def _score(scan: KnownScan, result: MethodResult | Segmentation) -> Rows:
             scan.ground_z[ground], result.ground_z[ground], None if std is None else std[ground]
         )
     if scan.objects is not None:
-        rows['objects'] = count_objects(scan.points, label, scan.objects)
-        sums |= {name: sum(row[name] for row in rows['objects']) for name in OBJECT_COUNTS}
+        rows['objects'] = objects.count_objects(scan.points, label, scan.objects)
+        sums |= {name: sum(row[name] for row in rows['objects']) for name in objects.OBJECT_COUNTS}
     if isinstance(result, Segmentation):
         if scan.semantic is not None:
-            sums |= count_false_cells(scan.points, label, result.height, scan.semantic)
+            sums |= objects.count_false_cells(scan.points, label, result.height, scan.semantic)
         sums |= {name: getattr(result.fit, name) for name in FIT}
         sums |= {f'sensor_{name}': getattr(result.pose, name) for name in POSE}
         rows['times'] = [{k: s for k, s in result.timings.items() if k != 'total'}]

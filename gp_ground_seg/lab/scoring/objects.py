@@ -100,12 +100,12 @@ def count_objects(
     check_lengths(len(points), **vars(objects))
     x, y, z = points[:, :3].astype(np.float64).T
     reach = np.hypot(x, y)
-    on, n_classes = (objects.class_of >= 0) & np.isfinite(reach + z), len(CLASSES)
+    on = (objects.class_of >= 0) & np.isfinite(reach + z)
     least = np.where(_is_low(objects.class_of), LOW_MIN_HEIGHT, MIN_HEIGHT)
     counts, lacks = on & (z - objects.ground_z >= least), on & np.isnan(objects.ground_z)
-    unknown = _by_class_and_band(objects.class_of[lacks], reach[lacks], lacks[lacks], n_classes)
+    unknown = _by_class_and_band(objects.class_of[lacks], reach[lacks], lacks[lacks])
     kind, reach, is_ground = objects.class_of[counts], reach[counts], label[counts] == Label.GROUND
-    returns = _by_class_and_band(kind, reach, is_ground, n_classes)
+    returns = _by_class_and_band(kind, reach, is_ground)
 
     known = (object_id := objects.object_id[counts]) != 0
     pairs = np.column_stack([kind, object_id])[known]
@@ -117,7 +117,7 @@ def count_objects(
     middle = _medians(reach[known], number, len(n_returns))
     enough = n_returns >= np.where(_is_low(of_object[:, 0]), LOW_MIN_RETURNS, MIN_RETURNS)
     lost = 2 * n_ground[enough] > n_returns[enough]
-    found = _by_class_and_band(of_object[enough, 0], middle[enough], lost, n_classes)
+    found = _by_class_and_band(of_object[enough, 0], middle[enough], lost)
     bands = np.concatenate([returns, found, unknown[:, :, :1]], axis=2)
     return [
         {'class': name, 'range': band, **dict(zip(OBJECT_COUNTS, numbers, strict=True))}
@@ -133,10 +133,10 @@ def _is_low(class_of: npt.NDArray[np.integer]) -> BoolArray:
 
 
 def _by_class_and_band(
-    kind: npt.NDArray[np.integer], reach: FloatArray, is_counted: BoolArray, n_classes: int
+    kind: npt.NDArray[np.integer], reach: FloatArray, is_counted: BoolArray
 ) -> IntArray:
     """Count (classes, bands, 2): all, and those with `is_counted`."""
-    n_bands = len(BAND_TITLES)
+    n_classes, n_bands = len(CLASSES), len(BAND_TITLES)
     code = n_bands * kind + np.digitize(reach, BAND_EDGES[1:-1])
     n = [np.bincount(part, minlength=n_classes * n_bands) for part in (code, code[is_counted])]
     return np.column_stack(n).reshape(n_classes, n_bands, 2)

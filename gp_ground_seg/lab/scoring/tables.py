@@ -6,7 +6,7 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.lab.scoring import metrics, report
+from gp_ground_seg.lab.scoring import metrics, objects, report
 from gp_ground_seg.lab.scoring.comparison import (
     INTERVAL,
     difference_table,
@@ -17,28 +17,7 @@ from gp_ground_seg.lab.scoring.comparison import (
 )
 from gp_ground_seg.lab.scoring.evaluate import FIT, POSE, title_of
 from gp_ground_seg.lab.scoring.frames import ALL, KEYS, Scores, each, sums, with_all
-from gp_ground_seg.lab.scoring.metrics import (
-    Measure,
-    calibration_error,
-    height_ratios,
-    label_ratios,
-    ratio,
-)
-from gp_ground_seg.lab.scoring.objects import (
-    BAND_TITLES,
-    CLASSES,
-    CUT_HEIGHT,
-    FALSE_OVER,
-    FALSE_RANGE,
-    FALSE_SIZE,
-    LOW_OVER,
-    LOW_RANGE,
-    LOW_THINGS,
-    MIN_HEIGHT,
-    MIN_RETURNS,
-    OBJECT_COUNTS,
-    SHARES,
-)
+from gp_ground_seg.lab.scoring.metrics import Measure, height_ratios, label_ratios, ratio
 from gp_ground_seg.lab.scoring.report import (
     Column,
     Report,
@@ -53,7 +32,7 @@ if TYPE_CHECKING:
 
 RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
 SHARE_TITLES = {
-    LOW_THINGS: ('low returns', percent('as ground')),
+    objects.LOW_THINGS: ('low returns', percent('as ground')),
     'road_cells': ('road cells', percent('false', form='.3f')),
     'ground_cells': ('ground cells', percent('false', form='.3f')),
 }
@@ -61,7 +40,7 @@ SHARE_TITLES = {
 
 
 def evaluation(
-    scores: Scores, config: Config, n_workers: int = 0, cut: float = CUT_HEIGHT
+    scores: Scores, config: Config, n_workers: int = 0, cut: float = objects.CUT_HEIGHT
 ) -> Report:
     """Report of our method with `config`, and of at most one other method on the same scans.
 
@@ -100,7 +79,7 @@ def make_report(tables: dict[str, Table], scores: Scores, base: Config, **facts:
 
 def scan_rows(scores: Scores) -> list[dict[str, Any]]:
     """Every number of each scan of each method; heights in metres, angles in radians."""
-    bins, objects = (
+    bins, counts_of = (
         dict(iter(frame.groupby([*KEYS], sort=False))) for frame in (scores.bins, scores.objects)
     )
     heights = 'n_points', 'n_without_model', 'median_absolute'
@@ -117,14 +96,14 @@ def scan_rows(scores: Scores) -> list[dict[str, Any]]:
             found = {name: own[name] for name in heights} | height_ratios(own)
             row |= {f'{name}_all': value for name, value in found.items()}
         if key in bins and bins[key]['n'].any():
-            row['ece'] = calibration_error(bins[key])
-        for name in SHARES:
+            row['ece'] = metrics.calibration_error(bins[key])
+        for name in objects.SHARES:
             if f'{name}_n' in own:
                 row[name] = {'n': own[f'{name}_n'], 'n_wrong': own[f'{name}_wrong']}
-        if key in objects:
+        if key in counts_of:
             row['objects'] = {
-                name: part.set_index('range')[[*OBJECT_COUNTS]].to_dict('index')
-                for name, part in objects[key].groupby('class', sort=False)
+                name: part.set_index('range')[[*objects.OBJECT_COUNTS]].to_dict('index')
+                for name, part in counts_of[key].groupby('class', sort=False)
             }
         rows.append(row)
     return rows
@@ -198,8 +177,8 @@ def object_table(scores: Scores) -> Table:
     """Lay out what of objects each method calls ground, by class and range."""
     rows = with_all(scores.objects, 'range')
     places = [
-        (name, band) for name in CLASSES if (rows['class'] == name).any()
-        for band in (*BAND_TITLES, ALL)
+        (name, band) for name in objects.CLASSES if (rows['class'] == name).any()
+        for band in (*objects.BAND_TITLES, ALL)
     ]  # fmt: skip
     pooled = sums(rows, 'class', 'range')
     found = [pooled.loc[[(method, *place) for place in places]] for method in scores.methods]
@@ -212,9 +191,9 @@ def object_table(scores: Scores) -> Table:
         percent('as ground', 'share_ground'): measure.of(found[0]),
     }
     title = (
-        f'Objects: returns on them from {MIN_HEIGHT:g} m above the local ground, and the share '
-        f'called ground [%]; objects with at least {MIN_RETURNS} such returns, and how many of '
-        'them are lost: more than half of these returns called ground'
+        f'Objects: returns on them from {objects.MIN_HEIGHT:g} m above the local ground, and the '
+        f'share called ground [%]; objects with at least {objects.MIN_RETURNS} such returns, and '
+        'how many of them are lost: more than half of these returns called ground'
     )
     parts = dict(iter(rows.groupby(['class', 'range'])))
     for peer, own in zip(scores.methods[1:], found[1:], strict=True):
@@ -254,13 +233,14 @@ def _share_table(scores: Scores, cut: float) -> Table:
                 share = ratio(own[f'{name}_wrong'], own[f'{name}_n'])
                 columns[dataclasses.replace(column, title=title, key=key)] = share
     low = (
-        f'low: returns left of objects that are cut at {cut:g} m, more than {LOW_OVER:g} m over '
-        f'the ground and within {LOW_RANGE:g} m, and the share called ground; '
+        f'low: returns left of objects that are cut at {cut:g} m, more than '
+        f'{objects.LOW_OVER:g} m over the ground and within {objects.LOW_RANGE:g} m, and the '
+        'share called ground; '
     )
     title = (
-        f'Low things and false cells  [%]; {low if cut else ""}cells of {FALSE_SIZE:g} m within '
-        f'{FALSE_RANGE:g} m that hold labelled road or ground, false: a return of it is called '
-        f'obstacle and is {FALSE_OVER:g} m or more over the surface'
+        f'Low things and false cells  [%]; {low if cut else ""}cells of {objects.FALSE_SIZE:g} m '
+        f'within {objects.FALSE_RANGE:g} m that hold labelled road or ground, false: a return of '
+        f'it is called obstacle and is {objects.FALSE_OVER:g} m or more over the surface'
     )
     title += f'; peer: {title_of(scores.methods[1])}' if scores.methods[1:] else ''
     return Table(columns, title, n_sums=1)
@@ -272,7 +252,7 @@ def _calibration_table(scores: Scores) -> Table:
     columns = {
         Column('sequence'): bins,
         Column('points', '_d'): [own['n'].sum() for own in bins.values()],
-        Column('ECE', '.4f', 'ece'): [calibration_error(own) for own in bins.values()],
+        Column('ECE', '.4f', 'ece'): [metrics.calibration_error(own) for own in bins.values()],
     }
     title = (
         'Probabilities (GroundGrid convention): expected calibration error over '
