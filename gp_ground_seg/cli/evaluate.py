@@ -1,4 +1,4 @@
-"""``evaluate``: score the segmentation against labels; what `bench` and `experiment` share."""
+"""``evaluate``: score the segmentation against labels; `experiment` takes the same frames."""
 
 from __future__ import annotations
 

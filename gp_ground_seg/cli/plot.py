@@ -14,6 +14,7 @@ from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
+from gp_ground_seg.data.atomic_output import check_writable
 from gp_ground_seg.data.semantic_kitti import read_labels
 from gp_ground_seg.lab.plotting import (
     CAMERA,
@@ -105,7 +106,10 @@ def _declare_segment(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Segment the scan and draw it."""
     config = options.read_config(arguments)
-    path = picture_path(arguments.output, force=arguments.force)
+    path = Path(arguments.output)
+    if path.suffix.lower() not in KINDS:
+        raise DataError(f'{path}: must end in {ENDINGS}')
+    check_writable(path, force=arguments.force)
     points, title = _read(arguments)
     truth = None
     if arguments.labels is not None:
@@ -122,16 +126,6 @@ def run(arguments: argparse.Namespace) -> int:
     print(f'{said}, written to {shown(path)}')
     options.note_spared(config, used)
     return 0
-
-
-def picture_path(name: str, *, force: bool) -> Path:
-    """Return the path of a picture to write; DataError if it cannot be one, or is there."""
-    path = Path(name)
-    if path.suffix.lower() not in KINDS:
-        raise DataError(f'{path}: must end in {ENDINGS}')
-    if path.exists() and not force:
-        raise DataError(f'{path}: exists already; --force replaces it')
-    return path
 
 
 def _integers(text: str) -> list[int]:
@@ -160,8 +154,8 @@ def _read(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], str]
 
 
 def _segment_numbers(arguments: argparse.Namespace, config: Config) -> list[int]:
-    if arguments.azimuth is None:
-        chosen: list[int] = arguments.segment
+    chosen: list[int] | None = arguments.segment
+    if chosen is not None:
         return chosen
     if not abs(arguments.azimuth) <= 360.0:
         wanted = 'a number of degrees, -360 to 360'
