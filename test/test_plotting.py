@@ -217,7 +217,7 @@ def test_command_draws_a_scan_and_keeps_what_is_there(drawn, tmp_path, capsys):
     before = path.read_bytes()
     for wrong, message in (
         ([path], '--force replaces it'),
-        ([tmp_path / 'a.jpg'], 'must end in .png'),
+        ([tmp_path / 'a.jpg'], 'must end in .png or .pdf or .svg'),
     ):
         assert run(*words, *wrong) == 2
         assert message in error_line(capsys)

@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from cli_runner import error_line, run
+from cli_runner import run
 from evaluation_samples import write_streets
 
 from gp_ground_seg import Config
@@ -87,8 +87,3 @@ def test_both_backends_are_timed_where_there_are_two(root, tmp_path, capsys):
     assert len(document['rows']) == 4 * 5 * speed.N_PASSES
     assert run('experiment', 'speed', root, '--set', 'runtime.backend=numpy', '--no-peer') == 0
     assert 'learning, numpy' not in capsys.readouterr().out
-
-
-def test_the_old_command_is_answered(capsys):
-    assert run('bench', 'ROOT') == 2
-    assert 'experiment speed ROOT' in error_line(capsys)

@@ -6,8 +6,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
-
 from gp_ground_seg.core.backend import make_backend
 from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.core.parameters.config import Config
@@ -79,20 +77,21 @@ def _load(frame: Frame) -> KnownScan:
 
 def _times(scores: Scores) -> Table:
     """Lay out medians and quantiles, and their ratios to Patchwork++ frame by frame."""
-    by_method = scores.scans.groupby('method', sort=False)
-    seconds = {name: by_method.get_group(name)['seconds'].to_numpy() for name in scores.methods}
+    scans = scores.scans
+    runs = scans.assign(run=scans.groupby('method').cumcount())
+    seconds = runs.pivot(index='run', columns='method', values='seconds')[scores.methods]
+    median, p99 = seconds.median(), seconds.quantile(0.99)
     columns: dict[Column, Any] = {
         Column('method'): [title_of(name) for name in scores.methods],
-        Column('median [ms]', '.2f', 'median', 1e3): [*map(np.median, seconds.values())],
-        Column('p99 [ms]', '.2f', 'p99', 1e3): [*map(_p99, seconds.values())],
+        Column('median [ms]', '.2f', 'median', 1e3): median,
+        Column('p99 [ms]', '.2f', 'p99', 1e3): p99,
     }
-    if (peer := seconds.get(PATCHWORKPP)) is not None:
+    if PATCHWORKPP in seconds:
         name = title_of(PATCHWORKPP)
-        ratios = [float(np.median(own / peer)) for own in seconds.values()]
-        columns[Column(f'/ {name}', '.2f', 'ratio')] = ratios
-        ratios = [_p99(own) / float(np.median(peer)) for own in seconds.values()]
-        columns[Column(f'p99 / {name} median', '.2f', 'p99_ratio')] = ratios
-    frames = scores.scans.drop_duplicates(['sequence', 'index'])
+        ratios = seconds.div(seconds[PATCHWORKPP], axis='index')
+        columns[Column(f'/ {name}', '.2f', 'ratio')] = ratios.median()
+        columns[Column(f'p99 / {name} median', '.2f', 'p99_ratio')] = p99 / median[PATCHWORKPP]
+    frames = scans.drop_duplicates(['sequence', 'index'])
     points = map(in_thousands, (frames['points'].median(), frames['points'].max()))
     title = (
         f'Time per frame: {len(frames)} frames, {N_PASSES} passes, reading left out; '
@@ -112,7 +111,3 @@ def _stages(scores: Scores) -> Table:
     for name in medians:
         columns[Column(str(name), '.2f', scale=1e3)] = medians[name]
     return Table(columns, 'Stages of a frame')
-
-
-def _p99(seconds: Any) -> float:
-    return float(np.percentile(seconds, 99))
