@@ -8,7 +8,7 @@ import numpy as np
 
 from gp_ground_seg.core.backend import Backend, make_backend
 from gp_ground_seg.core.frame import FloatArray, Frame, GroundSurface
-from gp_ground_seg.core.parameters.config import Config, RuntimeConfig
+from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.lab.scoring.evaluate import OurMethod
 
 TITLE = 'interpolation, our labels'
@@ -19,13 +19,15 @@ of six pairs on a third of the labelled frames."""
 
 def interpolation_method(config: Config) -> OurMethod:
     """Return our method with this surface in place of the model's, and nothing learned."""
-    fixed = config.replace(**{'learning.mode': 'fixed'})
-    return OurMethod(fixed, TITLE, interpolating_backend)
+    return InterpolationMethod(config.replace(**{'learning.mode': 'fixed'}))
 
 
-def interpolating_backend(runtime: RuntimeConfig) -> Any:
-    """Make the backend of the parameters, with this surface."""
-    return InterpolatingBackend(make_backend(runtime))
+class InterpolationMethod(OurMethod):
+    """Our method with the backend of the parameters, but for the surface."""
+
+    def __init__(self, config: Config, name: str = TITLE) -> None:
+        backend: Any = InterpolatingBackend(make_backend(config.runtime))
+        super().__init__(config, name, backend)
 
 
 class InterpolatingBackend:

@@ -13,10 +13,10 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.backend import Backend, make_backend
+from gp_ground_seg.core.backend import Backend
 from gp_ground_seg.core.errors import DataError, PointCloudError, shown
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
-from gp_ground_seg.core.parameters.config import Config, RuntimeConfig
+from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import Frame, read_entries, read_points
@@ -69,18 +69,12 @@ class OurMethod:
 
     depends_on_past = False
 
-    def __init__(
-        self,
-        config: Config,
-        name: str = OURS,
-        make: Callable[[RuntimeConfig], Backend] = make_backend,
-    ) -> None:
-        self.name, self._make = name, make
-        self._segmenter = GroundSegmenter(config, backend=make(config.runtime))
+    def __init__(self, config: Config, name: str = OURS, backend: Backend | None = None) -> None:
+        self.name, self._segmenter = name, GroundSegmenter(config, backend=backend)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Send the configuration to a worker."""
-        return type(self), (self._segmenter.config, self.name, self._make)
+        return type(self), (self._segmenter.config, self.name)
 
     def reset(self) -> None:
         """Do nothing: each scan is segmented by itself."""
