@@ -157,8 +157,7 @@ def test_refused_options(tmp_path, capsys):
         assert main(['demo', *words]) == 2
         assert message in capsys.readouterr().err
     for words in (['--frames', '0'], ['--frames', '1.5']):
-        with pytest.raises(SystemExit, match='2'):
-            main(['demo', *words])
+        assert main(['demo', *words]) == 2
         assert words[0] in capsys.readouterr().err
 
 

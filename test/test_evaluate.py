@@ -442,9 +442,8 @@ def test_errors_are_said_before_any_frame_is_read(
 
 @pytest.mark.parametrize('cut', ['-0.1', 'nan', 'low'])
 def test_a_height_of_the_cut_is_a_number_from_0_on(root, cut, capsys):
-    with pytest.raises(SystemExit):
-        run('evaluate', root, f'--cut={cut}')
-    assert 'must be a number, at least 0' in capsys.readouterr().err
+    assert run('evaluate', root, f'--cut={cut}') == 2
+    assert 'must be a number, at least 0' in error_line(capsys)
 
 
 def test_frames_without_a_scored_point_and_a_root_without_sequences(tmp_path, capsys):

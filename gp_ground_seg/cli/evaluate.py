@@ -12,7 +12,7 @@ from typing import Any
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import ConfigError, DataError, shown
-from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.parameters.config import Config, config_of
 from gp_ground_seg.data.inputs import Input, list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame, labelled_frames
 from gp_ground_seg.lab.scoring import report as results
@@ -137,7 +137,7 @@ def _other_config(arguments: argparse.Namespace, config: Config) -> tuple[Config
     """Return the parameters of ``--against``, and how those given differ, which they must."""
     if arguments.peer is not None:
         raise ConfigError('--against: compares with parameters, --peer with a method; give one')
-    other = options.named_config(arguments.against)
+    other = config_of(arguments.against)
     changed = options.changed_lines(other, config)
     if not changed:
         raise ConfigError(f'--against {arguments.against}: the same parameters as given')

@@ -8,17 +8,19 @@ import importlib
 import io
 import logging
 import os
+import re
 import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from difflib import get_close_matches
-from typing import NoReturn
+from pathlib import Path
+from typing import Any, NoReturn
 
 from gp_ground_seg import __version__
 from gp_ground_seg.core.errors import GroundSegError, in_one_line, reason_of, shown
 from gp_ground_seg.core.parameters.removed import removal_of_words
+from gp_ground_seg.core.parameters.schema import did_you_mean
 
 ROS_ARGS = '--ros-args'
 OF_ROS = ('-r', '--remap', '-p', '--param', '--params-file', '--log-level')
@@ -44,6 +46,8 @@ COMMANDS = {
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
 }
+FILE_COMMANDS = {'plot': 'scan', 'config': 'check'}
+"""Of the commands below a command, which is meant where a file stands in its place."""
 GROUPS = {'robot': 'node', 'files': 'segment', 'laboratory': 'evaluate'}
 """Groups of commands in the help, each with its first command."""
 
@@ -68,8 +72,50 @@ def _grouped_commands() -> str:
 
 
 class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, the same with every version of Python."""
+
     def error(self, message: str) -> NoReturn:
-        super().error(shown(message))
+        """Raise a GroundSegError, which names the help if the message has no next step."""
+        has_step = 'must be' in message or 'did you mean' in message
+        parts = [self.prog.partition(' ')[2], message.removeprefix('argument ')]
+        hint = '' if has_step else f'; {self.prog} --help lists what it takes'
+        raise GroundSegError(': '.join(filter(None, parts)) + hint)
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse a word that is none of the choices."""
+        if action.choices is None or value in action.choices:
+            return
+        file_command = FILE_COMMANDS.get(self.prog.split()[-1])
+        if file_command and (Path(value).suffix or Path(value).exists()):
+            hint = f'did you mean {self.prog} {file_command} {value}?'
+            raise argparse.ArgumentError(None, f'{value}: no {action.metavar}; {hint}')
+        names = [str(choice) for choice in action.choices]
+        message = f'{value!r}: must be one of {", ".join(names)}{did_you_mean(value, names)}'
+        raise argparse.ArgumentError(action, message)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse, in the parser of the last command, what it does not take."""
+        arguments, unknown = super().parse_known_args(args, namespace)
+        if unknown and not any(isinstance(a.choices, dict) for a in self._actions):
+            hint = self._hint_at(unknown[0], args)
+            self.error(f'unrecognized arguments: {" ".join(unknown)}{hint}')
+        return arguments, unknown
+
+    def _hint_at(self, word: str, words: Sequence[str]) -> str:
+        """Say what may be meant by one of the words, which is not taken."""
+        if word in OF_ROS and self.get_default('accepts_ros_args'):
+            return f'; did you mean {ROS_ARGS} {word}?'
+        options = {name: action for action in self._actions for name in action.option_strings}
+        if word.startswith('-'):
+            return did_you_mean(word.partition('=')[0], options) if word[1:2] == '-' else ''
+        # Of a list with spaces only the first word belongs to its option.
+        *_, option = ['', *(w for w in words[: words.index(word)] if w.startswith('-'))]
+        is_list = {name: re.search('LIST|,', f'{a.metavar}') for name, a in options.items()}
+        if option and any(is_list[name] for name in options if name.startswith(option)):
+            first, second = words[words.index(option) + 1 :][:2]
+            given = f'{option} {first.strip(",")},{second}'
+            return f'; the list must be without spaces, as in {given}'
+        return ''
 
 
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:
@@ -104,20 +150,13 @@ def _parse(words: list[str]) -> argparse.Namespace:
     if removed := removal_of_words(words[:n_before]):
         raise GroundSegError(removed)
     if command not in (None, *COMMANDS):
-        close = get_close_matches(command or '', COMMANDS, 1)
-        hint = f'did you mean {close[0]}?' if close else '--help lists them'
-        raise GroundSegError(f'{command}: no such command; {hint}')
+        hint = did_you_mean(command or '', COMMANDS) or '; --help lists them'
+        raise GroundSegError(f'{command}: no such command{hint}')
     parser = build_parser(command if command in COMMANDS else None)
-    arguments, unknown = parser.parse_known_args(words[:n_before])
-    accepts_ros_args = getattr(arguments, 'accepts_ros_args', False)
-    if unknown:
-        hint = f'gp-ground-seg {command} --help lists what it takes'
-        if accepts_ros_args and unknown[0] in OF_ROS:
-            hint = f'put {ROS_ARGS} before {unknown[0]}'
-        raise GroundSegError(f'{command}: unrecognized arguments: {" ".join(unknown)}; {hint}')
+    arguments = parser.parse_args(words[:n_before])
     arguments.ros_args = words[n_before:]
-    if arguments.ros_args and not accepts_ros_args:
-        parser.error(f'{ROS_ARGS}: this command takes none')
+    if arguments.ros_args and not getattr(arguments, 'accepts_ros_args', False):
+        raise GroundSegError(f'{command}: {ROS_ARGS}: this command takes none')
     return arguments
 
 

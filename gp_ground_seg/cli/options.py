@@ -19,7 +19,7 @@ from gp_ground_seg.core.errors import ConfigError, DataError, shown
 from gp_ground_seg.core.jit import has_to_compile
 from gp_ground_seg.core.parameters.config import PRESETS, Config, find_preset
 from gp_ground_seg.core.parameters.export import differences, yaml_scalar
-from gp_ground_seg.core.parameters.schema import load_yaml
+from gp_ground_seg.core.parameters.schema import YAML_SUFFIXES, did_you_mean, load_yaml
 from gp_ground_seg.data.atomic_output import leftovers, staged_file
 from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.data.scan_layout import KITTI_COLUMNS, MIN_COLUMNS
@@ -146,7 +146,10 @@ def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:
         unknown = [word for word in words if word not in names]
         if unknown or not words or len(set(words)) < len(words):
             wanted = ','.join(names)
-            raise argparse.ArgumentTypeError(f'{text!r}: must be some of {wanted}, each once')
+            hint = did_you_mean(unknown[0], names) if unknown else ''
+            raise argparse.ArgumentTypeError(
+                f'{text!r}: must be some of {wanted}, each once{hint}'
+            )
         return words
 
     return parse
@@ -167,8 +170,12 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 def read_config(arguments: argparse.Namespace) -> Config:
     """Return the preset, changed by the file, changed by the settings."""
+    if arguments.preset.endswith(YAML_SUFFIXES):
+        raise ConfigError(f'--preset {arguments.preset}: is a file, which --config reads')
     config = find_preset(arguments.preset).config
     if arguments.config:
+        if arguments.config in PRESETS and not Path(arguments.config).exists():
+            raise ConfigError(f'--config {arguments.config}: is a preset, which --preset takes')
         config = Config.from_yaml(arguments.config, config)
     return config.replace(**dict(parse_setting(setting) for setting in arguments.settings))
 
@@ -188,11 +195,6 @@ def note_spared(given: Config, used: Config) -> None:
     """Say how to have compiled code, where `spare_compiling` has done without."""
     if used.runtime != given.runtime:
         note('segmented with numpy; to have compiled code, run gp-ground-seg warm-up once')
-
-
-def named_config(name: str) -> Config:
-    """Return the parameters of a preset, or of a file."""
-    return PRESETS[name].config if name in PRESETS else Config.from_yaml(name)
 
 
 def changed_lines(first: Config, second: Config) -> list[str]:

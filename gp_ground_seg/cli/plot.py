@@ -130,7 +130,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _integers(text: str) -> list[int]:
     """Read numbers of segments."""
-    return [int(word) for word in text.split(',')]
+    try:
+        return [int(word) for word in text.split(',')]
+    except ValueError:
+        message = f'{text!r}: must be whole numbers, as in 157,158'
+        raise argparse.ArgumentTypeError(message) from None
 
 
 def _camera(text: str) -> Place:

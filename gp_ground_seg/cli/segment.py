@@ -69,7 +69,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add(
         parser,
         ('input', 'scan, folder of scans, bag, or a root', {'metavar': 'INPUT'}),
-        ('more', 'further bags', {'metavar': 'BAG', 'nargs': '*'}),
+        ('more', 'further bags', {'metavar': 'BAG', 'nargs': '*', 'default': []}),
         ('-o --output', 'for scans a folder, or a file for a single scan; for bags a folder, or '
          'a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
          {'metavar': 'OUT'}),

@@ -16,6 +16,7 @@ from typing import Any, Literal
 from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.parameters.schema import (
     AUTO,
+    YAML_SUFFIXES,
     ParameterGroups,
     ParameterSpec,
     ParameterValue,
@@ -459,7 +460,7 @@ def config_of(given: Config | str | Path | Mapping[str, Any] | None, **values: A
         config = given
     elif given is None or isinstance(given, Mapping):
         config = Config().replace(**{**given} if given else {})
-    elif isinstance(given, Path) or str(given).endswith(('.yaml', '.yml')):
+    elif isinstance(given, Path) or str(given).endswith(YAML_SUFFIXES):
         config = Config.from_yaml(given)
     else:
         config = find_preset(str(given)).config

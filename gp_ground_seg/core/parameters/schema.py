@@ -33,6 +33,7 @@ MAX_FILE_BYTES = 1 << 18  # twenty times the largest of config/
 MAX_VALUES = 500  # of a file: five times those there are
 MAX_DIGITS = 100  # of an integer; Python cannot print one of more than 4,300
 MAX_DEPTH = 20  # of values in each other: a parameter has five
+YAML_SUFFIXES = ('.yaml', '.yml')
 NO_VALUES = 'no parameters of the segmentation in it'
 _LOGGER = logging.getLogger('gp_ground_seg')
 OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
