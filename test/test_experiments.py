@@ -48,12 +48,29 @@ def test_models_are_what_their_names_say_and_each_way_to_learn_gives_a_theta(fra
 
 def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     """The worth of the latent process; docs/experiments.md has the whole table."""
-    names = ('constant, learned', 'Z, learned', 'Z-L, learned over the frame')
+    names = ('constant, learned', 'Z, learned', 'Z-L, learned')
     monkeypatch.setattr(ablation, 'MODELS', {name: MODELS[name] for name in names})
     frames = variants.simulated_frames(['hdl-64e'], [ablation.SCENE], 1, ablation.PLACES[1:])
     report = ablation.compare_models(frames, Config())
     constant, gradient, latent, _ = (row['rmse'] for row in report.tables['models'].json())
     assert latent < 0.95 * min(constant, gradient)
+
+
+def test_pairs_are_differences_of_models_that_learn_alike():
+    frames = variants.simulated_frames(['vlp-16'], ['ramp', 'bank'], 1, (0.0,))
+    tables = ablation.compare_models(frames, Config()).tables
+    of_models = {row['method']: row for row in tables['models'].json()}
+    pairs = tables['pairs'].json()
+    short = [(row['pair'], row['theta']) for row in pairs]
+    three = ['Z - constant', 'Z-L - constant', 'Z-L - Z']
+    assert sorted(short[:-1]) == sorted(itertools.product(three, ['learned', 'not learned']))
+    assert short[-1] == ('Z-L - interpolation', 'learned')
+    for row in pairs[:-1]:
+        ours, other = (of_models[f'{name}, {row["theta"]}'] for name in row['pair'].split(' - '))
+        for name in ('iou', 'rmse'):
+            assert row[name] == pytest.approx(ours[name] - other[name])
+            low, high = map(float, row[f'{name}_interval'].removesuffix(' tie').split(' to '))
+            assert low - 0.006 <= 100.0 * row[name] <= high + 0.006
 
 
 def test_steps_go_from_the_paper_to_the_defaults():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from gp_ground_seg.core.errors import ConfigError
@@ -47,7 +49,7 @@ MODELS: dict[str, Changes] = {
     'Z, not learned': {**_GRADIENT, **_FIXED},
     'Z, learned': {**_GRADIENT, **_LEARNED},
     'Z-L, not learned': {**_LATENT, **_FIXED},
-    'Z-L, learned over the frame': {**_LATENT, **_LEARNED},
+    'Z-L, learned': {**_LATENT, **_LEARNED},
 }
 """Length-scale models, each with theta given and learned; the last one is the paper's."""
 
@@ -74,30 +76,55 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     """Compare length-scale models and ways to learn.
 
     A constant length-scale, the gradients of the lines (Z), and the latent process (Z-L), and
-    beside them a surface that is interpolated between lowest points. On labelled frames, or on a
-    simulated smooth road that ends in rubble, by exact labels and heights.
+    beside them a surface that is interpolated between lowest points; then each pair with its
+    interval. On labelled frames, or on a simulated smooth road that ends in rubble, or the rough
+    ground of ``--scenes``, by exact labels and heights.
     """
     refuse_changed(config, {name for changes in MODELS.values() for name in changes}, _LATENT)
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     scores = score_variants(items, variants, [interpolation_method(config)], runner=runner)
-    *_, last = MODELS
     pooled = sums(scores.scans)
     columns = {
         Column('method'): scores.methods,
         percent('IoU [%]', 'iou'): _iou(scores).of(pooled),
         **_worst(scores),
         centimetres('RMSE [cm]', 'rmse'): RMSE.of(pooled),
-        INTERVAL: [
-            None if name == last else interval_text(scores, last, RMSE, ours=name)
-            for name in scores.methods
-        ],
         centimetres('median [cm]', 'median_absolute'): _medians(scores),
     }
+    title = f'{_counted(scores)}; {_rule(scores)}; RMSE and median of the height under true ground'
+    tables = {'models': Table(columns, title), 'pairs': _pairs_table(scores)}
+    return make_report(tables, scores, config, changes=MODELS)
+
+
+def _pairs_table(scores: Scores) -> Table:
+    """Compare Z-L, Z and a constant, each pair, and Z-L and the interpolation."""
+    known = [name for name in MODELS if name in scores.methods]
+    pairs = [
+        (ours, other)
+        for other, ours in itertools.combinations(known, 2)
+        if MODELS[ours]['learning.mode'] == MODELS[other]['learning.mode']
+    ]
+    pairs.append((known[-1], scores.methods[-1]))
+    pooled = sums(scores.scans)
+    models = [[name.partition(',')[0] for name in pair] for pair in pairs]
+    columns: dict[Column, Any] = {
+        Column('pair'): [' - '.join(names) for names in models],
+        Column('theta'): [ours.partition(', ')[2] for ours, _ in pairs],
+    }
+    for column, measure in (
+        (percent('IoU', 'iou', '+.2f'), _iou(scores)),
+        (replace(centimetres('RMSE', 'rmse'), format='+.2f'), RMSE),
+    ):
+        value = measure.of(pooled)
+        columns[column] = [value[ours] - value[other] for ours, other in pairs]
+        columns[Column(f'{column.title}, 95 % interval', key=f'{column.key}_interval')] = [
+            interval_text(scores, other, measure, ours=ours) for ours, other in pairs
+        ]
     title = (
-        f'{_counted(scores)}; {_rule(scores)}; RMSE and median of the height under true ground, '
-        f'interval of the RMSE minus that of {last}; {interval_note(scores)}'
+        'Differences of IoU [%], where more is better, and of RMSE [cm], where less is; '
+        f'{interval_note(scores)}'
     )
-    return make_report({'models': Table(columns, title)}, scores, config, changes=MODELS)
+    return Table(columns, title)
 
 
 def paper_steps() -> dict[str, Config]:

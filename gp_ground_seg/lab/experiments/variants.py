@@ -69,7 +69,7 @@ def load_simulated(frame: SimulatedFrame) -> KnownScan:
         frame.sequence, f'{frame.seed}/{frame.x:g}', made.points, {'exact': truth},
         ground_z=made.ground_z, is_ground=made.is_ground,
         objects=Objects(_class_of(scene, made), made.object_id, made.ground_z),
-        std='ground_std', cluster=f'{frame.sequence} {frame.seed}',
+        std='ground_std', cluster=f'{frame.scene} {frame.seed}',
     )  # fmt: skip
 
 
