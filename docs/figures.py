@@ -11,9 +11,13 @@ else there is to say; what stands between the two is written here:
 sample: WORDS          further words for a run of seconds; its rows are kept in docs/samples.json,
                        by command, and test/test_pages.py computes them again
 keep: TITLE; TITLE     only the tables whose titles begin so
+drop: TITLE; TITLE     without the columns of these titles
 picture: FILE -> PATH  the file that the command makes, and its place in the repository
 
 A command is one of gp-ground-seg, or a Python script: docs/drive.py.
+
+Rows and columns without a number are left out: - is none, and 0 is none beside it. A page has one
+line on the machine, below its last tables; above each figure is its commit.
 
 Pages and pictures are written when all commands have run: each runs on the commit it names.
 """
@@ -30,6 +34,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -47,6 +52,7 @@ FIGURE = re.compile(
 )
 SAMPLES = REPOSITORY / 'docs' / 'samples.json'
 ROOT = 'KITTI_ROOT'
+MACHINE = 'machine: '
 
 
 class Figure(NamedTuple):
@@ -117,16 +123,28 @@ def rows_of(output: str) -> list[str]:
 
 def kept(figure: Figure, output: str) -> str:
     """Return the tables of an output that a figure keeps, and the lines on the machine."""
-    if 'keep' not in figure.options:
-        return output
-    titles, parts = tuple(figure.options['keep'].split('; ')), output.split('\n\n')
-    tables = [f'{a}\n\n{b}' for a, b in pairwise(parts) if a.startswith(titles)]
-    machine = [part for part in parts if part.startswith('machine: ')]
-    return '\n\n'.join([*tables, *machine])
+    parts = output.split('\n\n')
+    if 'keep' in figure.options:
+        titles = tuple(figure.options['keep'].split('; '))
+        tables = [part for a, b in pairwise(parts) if a.startswith(titles) for part in (a, b)]
+        parts = [*tables, *(part for part in parts if part.startswith(MACHINE))]
+    dropped = figure.options.get('drop', '').split('; ')
+    return '\n\n'.join(trimmed(part, dropped) if part.startswith('| ') else part for part in parts)
 
 
-def body_of(figure: Figure, output: str, commit: str) -> str:
-    """Write what stands between the comments."""
+def trimmed(table: str, dropped: Sequence[str]) -> str:
+    """Return a table without some columns, nor rows and columns that have no number."""
+    titles, rule, *rows = (line[2:-2].split(' | ') for line in table.splitlines())
+    numbers = [k for k, mark in enumerate(rule) if mark.endswith(':')]
+    rows = [row for row in rows if '-' not in row or {row[k] for k in numbers} - {'-', '0'}]
+    empty = {k for k in numbers if all(row[k] == '-' for row in rows)}
+    wanted = [k for k, title in enumerate(titles) if title not in dropped and k not in empty]
+    lines = ([row[k] for k in wanted] for row in (titles, rule, *rows))
+    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+
+
+def body_of(figure: Figure, output: str, commit: str, *, is_last: bool = True) -> str:
+    """Write what stands between the comments; the last tables of a page say the machine."""
     is_script = figure.command.partition(' ')[0].endswith('.py')
     shown = f'`{"python" if is_script else "gp-ground-seg"} {figure.command}`'
     if 'picture' in figure.options:
@@ -138,7 +156,9 @@ def body_of(figure: Figure, output: str, commit: str) -> str:
     output = kept(figure, output)
     if '| ---' not in output:
         output = f'```text\n{output}\n```'
-    return f'{shown}\n\n{output}\n\n'
+    if not is_last:
+        output = output.partition(f'\n\n{MACHINE}')[0]
+    return f'{shown} (commit {commit})\n\n{output}\n\n'
 
 
 def read_samples() -> dict[str, list[str]]:
@@ -188,6 +208,7 @@ def main() -> int:
         parser.error(f'{arguments.kitti}: holds no sequences/; say make figures KITTI=PATH')
     texts = {page: (REPOSITORY / page).read_text(encoding='utf-8') for page in PAGES}
     every = [figure for page, text in texts.items() for figure in find_figures(page, text)]
+    last_tables = {f.page: f.command for f in every if 'picture' not in f.options}
     chosen = arguments.part or ['']
     figures = [f for f in every if any(part in f'{f.page} {f.command}' for part in chosen)]
     commands = [c for figure in figures for c in (figure.command, figure.sample) if c is not None]
@@ -200,7 +221,8 @@ def main() -> int:
         outputs = run_all(list(dict.fromkeys(commands)), kitti, folder)
         done = [f for f in figures if {f.command, f.sample} - {None} <= outputs.keys()]
         for figure in done:
-            body = body_of(figure, outputs[figure.command], commit)
+            is_last = figure.command == last_tables.get(figure.page)
+            body = body_of(figure, outputs[figure.command], commit, is_last=is_last)
             texts[figure.page] = replaced(texts[figure.page], figure, body)
             if figure.sample is not None:
                 samples[figure.sample] = rows_of(kept(figure, outputs[figure.sample]))

@@ -234,11 +234,10 @@ def rough_table(scores: Scores) -> Table:
     title = (
         'Rough and steep ground, means over the sensors: IoU against exact labels [%], every '
         'point counts; RMSE of the surface under true ground [cm]; vehicles, persons and crates, '
-        'and how many of these objects are lost, as in the other tables; told: '
-        f'{scores.methods[0]} with the true height of the sensor'
+        'and how many of these objects are lost, as in the other tables'
     )
-    title += f'; peer: {title_of(others[0])} with the same' if others else ''
-    return Table(columns, title, n_sums=1)
+    title += f'; peer: {title_of(others[0])}, which gets the true height' if others else ''
+    return Table(columns, title, [f'told: {scores.methods[0]} with the true height'], n_sums=1)
 
 
 def return_table(scores: Scores) -> Table:

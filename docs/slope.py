@@ -1,0 +1,80 @@
+"""Draw what a costmap marks of a hill, for README: ``python docs/slope.py slope.png``."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+
+from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.core.frame import BoolArray, PointArray
+from gp_ground_seg.core.log import in_thousands
+from gp_ground_seg.data.colours import COLOURS
+from gp_ground_seg.data.costmap import SegmentedCloud
+from gp_ground_seg.lab.plotting.scan import add_axes, legend_dots, new_figure, save, write_line
+from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
+
+LOW, HIGH = 0.15, 1.5
+"""Heights that a robot can hit [m]."""
+CELL, REACH = 0.1, 20.0
+"""Size of the cells, and how far away they are marked [m]."""
+SEED = 1
+SIDE = 4.2
+"""Width of a map [inch]."""
+
+
+def cells_of(xy: PointArray, chosen: BoolArray) -> BoolArray:
+    """Cells that one of the chosen points is in, (n, n) bool, by x, y."""
+    n = round(2.0 * REACH / CELL)
+    near = chosen & (np.hypot(*xy.T) < REACH)
+    cells = np.zeros((n, n), dtype=bool)
+    cells[tuple(np.floor((xy[near] + REACH) / CELL).astype(int).T)] = True
+    return cells
+
+
+def draw(figure: Any, left: float, title: str, layers: dict[str, BoolArray]) -> None:
+    """Draw a map from above, x to the right, `left` inches from the edge."""
+    axes = add_axes(figure, left, 0.4, (SIDE, SIDE))
+    for name, layer in layers.items():
+        places = (np.argwhere(layer) + 0.5) * CELL - REACH
+        axes.scatter(*places.T, s=0.8, linewidths=0.0, c=COLOURS[name])
+    axes.set_axis_off()
+    axes.set_aspect('equal')
+    write_line(figure, title, (left + 0.5 * SIDE) / figure.get_size_inches()[0], 0.15, fontsize=12)
+
+
+def main(path: str) -> int:
+    """Simulate, segment, count and draw."""
+    scan = simulate_scan(SCENES['crest'](SEED), HDL_64E, np.random.default_rng(SEED))
+    xy, up = scan.points[:, :2], scan.points[:, 2] + HDL_64E.height
+    config = Config().replace(**{'output.min_height': LOW, 'output.max_height': HIGH})
+    result = GroundSegmenter(config).segment(scan.points)
+    chosen = {
+        f'raw cloud, {LOW:g} to {HIGH:g} m up': (up >= LOW) & (up <= HIGH),
+        'obstacles of gp_ground_seg': SegmentedCloud(None, result, config).is_obstacle,
+    }
+    thing = cells_of(xy, ~scan.is_ground)
+    ground = cells_of(xy, scan.is_ground) & ~thing
+    figure, said = new_figure(2.0 * SIDE + 0.2, SIDE + 0.7), []
+    for k, (title, points) in enumerate(chosen.items()):
+        marked = cells_of(xy, points)
+        layers = {'ground': ground & ~marked, 'obstacle': thing & marked}
+        layers['false ground'] = ground & marked
+        draw(figure, k * (SIDE + 0.2), title, layers)
+        numbers = [in_thousands(layers[name].sum()) for name in ('false ground', 'obstacle')]
+        said.append(f'marks {numbers[0]} of ground, {numbers[1]} of things')
+    names = {'ground': 'ground', 'thing, marked': 'obstacle', 'ground, marked': 'false ground'}
+    dots = legend_dots({shown: COLOURS[name] for shown, name in names.items()}, 7)
+    figure.legend(handles=dots, loc='lower center', fontsize=11, frameon=False, ncols=3)
+    save(figure, path)
+    n_ground, n_things = (in_thousands(cells.sum()) for cells in (ground, thing))
+    print(
+        f'{n_ground} cells of ground, {n_things} of things: the raw cloud {said[0]}; '
+        f'gp_ground_seg {said[1]}, written to {path}'
+    )
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1]))
