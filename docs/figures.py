@@ -12,6 +12,7 @@ sample: WORDS          further words for a run of seconds; its rows are kept in 
                        by command, and test/test_pages.py computes them again
 keep: TITLE; TITLE     only the tables whose titles begin so
 drop: TITLE; TITLE     without the columns of these titles
+rows: PATTERN          only the rows in which this regular expression is found
 picture: FILE -> PATH  the file that the command makes, and its place in the repository
 
 A command is one of gp-ground-seg, or a Python script: docs/drive.py.
@@ -128,19 +129,23 @@ def kept(figure: Figure, output: str) -> str:
         titles = tuple(figure.options['keep'].split('; '))
         tables = [part for a, b in pairwise(parts) if a.startswith(titles) for part in (a, b)]
         parts = [*tables, *(part for part in parts if part.startswith(MACHINE))]
-    dropped = figure.options.get('drop', '').split('; ')
-    return '\n\n'.join(trimmed(part, dropped) if part.startswith('| ') else part for part in parts)
+    dropped, wanted = figure.options.get('drop', '').split('; '), figure.options.get('rows', '')
+    return '\n\n'.join(
+        trimmed(part, dropped, wanted) if part.startswith('| ') else part for part in parts
+    )
 
 
-def trimmed(table: str, dropped: Sequence[str]) -> str:
-    """Return a table without some columns, nor rows and columns that have no number."""
-    titles, rule, *rows = (line[2:-2].split(' | ') for line in table.splitlines())
+def trimmed(table: str, dropped: Sequence[str] = (), wanted: str = '') -> str:
+    """Return a table without some columns and rows, and without those that have no number."""
+    above, lines = table.splitlines()[:2], table.splitlines()[2:]
+    lines = [line for line in lines if re.search(wanted, line)]
+    titles, rule, *rows = (line[2:-2].split(' | ') for line in (*above, *lines))
     numbers = [k for k, mark in enumerate(rule) if mark.endswith(':')]
     rows = [row for row in rows if '-' not in row or {row[k] for k in numbers} - {'-', '0'}]
     empty = {k for k in numbers if all(row[k] == '-' for row in rows)}
-    wanted = [k for k, title in enumerate(titles) if title not in dropped and k not in empty]
-    lines = ([row[k] for k in wanted] for row in (titles, rule, *rows))
-    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+    left = [k for k, title in enumerate(titles) if title not in dropped and k not in empty]
+    cells = ([row[k] for k in left] for row in (titles, rule, *rows))
+    return '\n'.join(f'| {" | ".join(line)} |' for line in cells)
 
 
 def body_of(figure: Figure, output: str, commit: str, *, is_last: bool = True) -> str:

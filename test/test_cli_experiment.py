@@ -48,8 +48,8 @@ def few_places(monkeypatch):
 
 
 CASES = {
-    'ablation': (['ROOT', '--frame-step', '2', *SMALL], 'models', 7 * 3),
-    'ablation --simulated': (['--seeds', '1', *SMALL], 'pairs', 7),
+    'ablation': (['ROOT', '--frame-step', '2', *SMALL], 'models', 8 * 3),
+    'ablation --simulated': (['--seeds', '1', *SMALL], 'pairs', 8),
     'steps': (['ROOT', '--frame-step', '3'], 'steps', 9 * 2),
     'pseudo-inputs': (['ROOT', '--frame-step', '3', *SMALL], 'pseudo_inputs', 7 * 2),
     'scenes': (

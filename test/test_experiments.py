@@ -43,12 +43,13 @@ def test_models_are_what_their_names_say_and_each_way_to_learn_gives_a_theta(fra
         for name, config in configs.items()
     }
     assert len(set(theta.values())) == len(MODELS) - 2
+    assert configs['Z-L, learned'] == Config()
     assert len({values for name, values in theta.items() if 'not learned' in name}) == 1
 
 
 def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     """The worth of the latent process; docs/experiments.md has the whole table."""
-    names = ('constant, learned', 'Z, learned', 'Z-L, learned')
+    names = ('constant, learned', 'Z, learned', 'Z-L, all learned')
     monkeypatch.setattr(ablation, 'MODELS', {name: MODELS[name] for name in names})
     frames = variants.simulated_frames(['hdl-64e'], [ablation.SCENE], 1, ablation.PLACES[1:])
     report = ablation.compare_models(frames, Config())
@@ -61,11 +62,14 @@ def test_pairs_are_differences_of_models_that_learn_alike():
     tables = ablation.compare_models(frames, Config()).tables
     of_models = {row['method']: row for row in tables['models'].json()}
     pairs = tables['pairs'].json()
-    short = [(row['pair'], row['theta']) for row in pairs]
     three = ['Z - constant', 'Z-L - constant', 'Z-L - Z']
-    assert sorted(short[:-1]) == sorted(itertools.product(three, ['learned', 'not learned']))
-    assert short[-1] == ('Z-L - interpolation', 'learned')
-    for row in pairs[:-1]:
+    *alike, more, last = [(row['pair'], row['theta']) for row in pairs]
+    assert sorted(alike) == sorted(itertools.product(three, ['learned', 'not learned']))
+    assert (more, last) == (
+        ('Z-L - Z-L', 'all learned - learned'),
+        ('Z-L - interpolation', 'learned'),
+    )
+    for row in pairs[:-2]:
         ours, other = (of_models[f'{name}, {row["theta"]}'] for name in row['pair'].split(' - '))
         for name in ('iou', 'rmse'):
             assert row[name] == pytest.approx(ours[name] - other[name])

@@ -41,7 +41,8 @@ _FIXED: Changes = {'learning.mode': 'fixed'}
 _LEARNED: Changes = {'learning.mode': 'every_frame'}
 _CONSTANT: Changes = {'length_scale.model': 'constant'}
 _GRADIENT: Changes = {'length_scale.model': 'line_gradient'}
-_LATENT: Changes = {'length_scale.model': 'latent', 'learning.fixed': 'none'}
+_LATENT: Changes = {'length_scale.model': 'latent'}
+_ALL: Changes = {'learning.fixed': 'none'}
 
 MODELS: dict[str, Changes] = {
     'constant, not learned': {**_CONSTANT, **_FIXED},
@@ -50,8 +51,10 @@ MODELS: dict[str, Changes] = {
     'Z, learned': {**_GRADIENT, **_LEARNED},
     'Z-L, not learned': {**_LATENT, **_FIXED},
     'Z-L, learned': {**_LATENT, **_LEARNED},
+    'Z-L, all learned': {**_LATENT, **_LEARNED, **_ALL},
 }
-"""Length-scale models, each with theta given and learned; the last one is the paper's."""
+"""Length-scale models, each with theta given and with sigma_f and sigma_n learned, as by default;
+the last one learns all length-scales too, as the paper does."""
 
 SCENE = 'road_then_rubble'
 PLACES = (0.0, 6.0, 12.0)
@@ -80,7 +83,7 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     interval. On labelled frames, or on a simulated smooth road that ends in rubble, or the rough
     ground of ``--scenes``, by exact labels and heights.
     """
-    refuse_changed(config, {name for changes in MODELS.values() for name in changes}, _LATENT)
+    refuse_changed(config, {name for changes in MODELS.values() for name in changes}, _ALL)
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     scores = score_variants(items, variants, [interpolation_method(config)], runner=runner)
     pooled = sums(scores.scans)
@@ -98,18 +101,22 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
 
 def _pairs_table(scores: Scores) -> Table:
     """Compare Z-L, Z and a constant, each pair, and Z-L and the interpolation."""
-    known = [name for name in MODELS if name in scores.methods]
+    learned = 'Z-L, learned'
     pairs = [
         (ours, other)
-        for other, ours in itertools.combinations(known, 2)
-        if MODELS[ours]['learning.mode'] == MODELS[other]['learning.mode']
+        for other, ours in itertools.combinations(MODELS, 2)
+        if ours.partition(', ')[2] == other.partition(', ')[2]
     ]
-    pairs.append((known[-1], scores.methods[-1]))
+    pairs += [('Z-L, all learned', learned), (learned, scores.methods[-1])]
+    pairs = [pair for pair in pairs if {*pair} <= {*scores.methods}]
     pooled = sums(scores.scans)
     models = [[name.partition(',')[0] for name in pair] for pair in pairs]
     columns: dict[Column, Any] = {
         Column('pair'): [' - '.join(names) for names in models],
-        Column('theta'): [ours.partition(', ')[2] for ours, _ in pairs],
+        Column('theta'): [
+            ' - '.join(dict.fromkeys(name.partition(', ')[2] for name in pair if name in MODELS))
+            for pair in pairs
+        ],
     }
     for column, measure in (
         (percent('IoU', 'iou', '+.2f'), _iou(scores)),
@@ -175,10 +182,10 @@ def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner =
 
     All length-scales are learned.
     """
-    refuse_changed(config, ['latent.candidates_per_pseudo_input', *_LATENT], _LATENT)
+    refuse_changed(config, ['latent.candidates_per_pseudo_input', *_LATENT, *_ALL], _ALL)
     names = {f'{n:g}': n for n in CANDIDATES_PER_PSEUDO_INPUT}
     variants = {
-        name: config.replace(**_LATENT, **{'latent.candidates_per_pseudo_input': n})
+        name: config.replace(**_LATENT, **_ALL, **{'latent.candidates_per_pseudo_input': n})
         for name, n in names.items()
     }
     scores = score_variants(items, variants, runner=runner)
