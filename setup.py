@@ -54,12 +54,13 @@ DEV = [
 
 setup(
     name=PACKAGE,
-    version='0.3.0',  # a literal: catkin_prepare_release writes it here and into package.xml
+    version='0.4.0',  # a literal: catkin_prepare_release writes it here and into package.xml
     description='Ground segmentation of LiDAR scans with two coupled Gaussian processes',
     long_description=Path('README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     license='Apache-2.0',
-    url='https://arxiv.org/abs/2112.05847',
+    url='https://example.org/gp_ground_seg',  # a placeholder, as in package.xml and README.md
+    project_urls={'Paper': 'https://arxiv.org/abs/2112.05847'},
     author='gp_ground_seg maintainers',
     maintainer='gp_ground_seg maintainers',
     maintainer_email='maintainers@users.noreply.h-seed-aac284b4.example',

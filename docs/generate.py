@@ -13,9 +13,8 @@ SCORES = 'scores'
 PAGE_HEAD = """\
 # Parameters
 
-`make generate` writes this page from `gp_ground_seg/core/parameters/config.py`. `gp-ground-seg
-config dump` writes all parameters, with values and ranges, as a parameter file. A symbol is that
-of the paper.
+`make generate` writes this page. `gp-ground-seg config dump` writes all parameters, with values
+and ranges, as a parameter file. Symbols in brackets are those of the paper.
 
 ## Those that people set
 
@@ -38,16 +37,15 @@ out, and warn. Topics begin with `~/`: a subscriber of one gets no message.
 def to_markdown_table(*, basic: bool) -> str:
     """Write the parameters that are basic, or the others, one row each, in their order."""
     rows = [
-        ('Parameter', 'Default', 'Accepted', 'Unit', 'Symbol', 'Meaning'),
-        ('---', '---', '---', '---', '---', '---'),
+        ('Parameter', 'Default', 'Accepted', 'Meaning'),
+        ('---', '---', '---', '---'),
     ]
     for spec in parameter_specs():
         if spec.basic == basic:
             name, default = f'`{spec.name}`', f'`{yaml_scalar(spec.default)}`'
-            symbol = f'`{spec.symbol}`' if spec.symbol else ''
-            rows.append(
-                (name, default, accepted_values(spec), spec.unit, symbol, spec.description)
-            )
+            accepted = f'{accepted_values(spec)} {spec.unit}'.rstrip()
+            symbol = f' (`{spec.symbol}`)' if spec.symbol else ''
+            rows.append((name, default, accepted, f'{spec.description}{symbol}'))
     lines = ['| ' + ' | '.join(cell.replace('|', r'\|') for cell in row) + ' |' for row in rows]
     return '\n'.join(lines) + '\n'
 
@@ -117,7 +115,10 @@ def generated_files(readme: str) -> dict[str, str]:
         for preset in PRESETS.values()
     }
     files[README] = with_table(readme, SCORES, to_scores_table())
-    removed = ''.join(f'| `{name}` | {instead} |\n' for name, instead in REMOVED.items())
+    names: dict[str, list[str]] = {}
+    for name, instead in REMOVED.items():
+        names.setdefault(instead, []).append(f'`{name}`')
+    removed = ''.join(f'| {", ".join(own)} | {instead} |\n' for instead, own in names.items())
     tables = OTHERS_HEAD.join(to_markdown_table(basic=basic) for basic in (True, False))
     files['docs/parameters.md'] = PAGE_HEAD + tables + REMOVED_HEAD + removed
     return files

@@ -83,6 +83,18 @@ def test_one_version(package):
     assert newest == 'Forthcoming' or re.fullmatch(rf'{version} \(\d{{4}}-\d\d-\d\d\)', newest)
 
 
+def test_the_address_of_the_repository_is_the_same_everywhere(package):
+    """A placeholder in one form: who publishes the package replaces it in four files."""
+    address = package.findtext("url[@type='repository']")
+    assert address.startswith('https://')
+    for name, line in (
+        ('setup.py', f"url='{address}',"),
+        ('CITATION.cff', f'repository-code: {address}\n'),
+        ('README.md', f'`git clone {address}.git`'),
+    ):
+        assert (REPOSITORY / name).read_text(encoding='utf-8').count(line) == 1, name
+
+
 @pytest.mark.filterwarnings('ignore:nodes.Node.traverse')  # docutils, of catkin_pkg
 def test_the_tools_of_ros_take_package_xml_and_changelog_and_set_the_version(tmp_path):
     """Those of catkin, which colcon and bloom use as well."""

@@ -82,7 +82,6 @@ def test_every_figure_is_as_it_was_written():
 
 
 NO_FIGURES = {
-    'images/street.png',  # a figure of README.md
     'images/tune.png',  # a screenshot, of what test_browser.py looks at
 }
 
@@ -187,6 +186,35 @@ def test_the_citation_is_of_this_version():
     assert 'arXiv:2112.05847' in str(citation['preferred-citation']['identifiers'])
 
 
+def test_readme_is_short():
+    """At most 1,000 words and 60 numbers in what is read: commands and code left out."""
+    text = (REPOSITORY / 'README.md').read_text(encoding='utf-8')
+    assert len(text.split()) <= 1000
+    for part in (
+        r'<!--.*?-->',
+        r'```.*?```',
+        r'`.*?`',
+        r'\]\(.*?\)',
+        r'commit \w+',
+        r'\[arXiv.*?\]',
+    ):
+        text = re.sub(part, '', text, flags=re.DOTALL)
+    # Thousands are set apart by a blank.
+    assert len(re.findall(r'[-+]?\d[\d.]*(?: \d{3}\b)*', text)) <= 60
+
+
+def test_rows_and_columns_without_a_number_are_left_out():
+    table = """\
+| a | n | x | y |
+| --- | --: | --: | --: |
+| one | 3 | 1.5 | - |
+| two | 0 | - | - |
+| three | 0 | 0.0 | - |"""
+    three = '| one | 3 | 1.5 |\n| three | 0 | 0.0 |'
+    assert figures.trimmed(table) == f'| a | n | x |\n| --- | --: | --: |\n{three}'
+    assert figures.trimmed(table, ['n'], 'one|two') == '| a | x |\n| --- | --: |\n| one | 1.5 |'
+
+
 def test_the_page_of_the_commands_has_all_of_them():
     """docs/cli.md gets the help of every command when the pages are built."""
     text = (REPOSITORY / 'docs' / 'cli.md').read_text(encoding='utf-8')
@@ -254,7 +282,8 @@ def test_a_command_is_run_in_a_folder_of_its_own(tmp_path):
 
 def test_only_the_tables_that_a_figure_keeps():
     (figure,) = figures.find_figures('a.md', PAGE.replace('sample:', 'keep: B; C\nsample:'))
-    parts = ['A is', '| a |', 'a note', 'B is', '| b |', 'C', '| c |', 'machine: x', 'result']
+    a, b, c = (f'| {name} |\n| --- |\n| 1 |' for name in 'abc')
+    parts = ['A is', a, 'a note', 'B is', b, 'C', c, 'machine: x', 'result']
     assert figures.kept(figure, '\n\n'.join(parts)) == '\n\n'.join(parts[3:-1])
 
 
