@@ -1,4 +1,4 @@
-"""Rewrite config/*.yaml, the tables of parameters, and README's scores: `make generate`."""
+"""Rewrite config/*.yaml, the page of parameters, and README's scores: `make generate`."""
 
 from pathlib import Path
 
@@ -13,15 +13,19 @@ SCORES = 'scores'
 PAGE_HEAD = """\
 # Parameters
 
-`make generate` writes this page. `gp-ground-seg config dump` writes all parameters, with values
-and ranges, as a parameter file. Symbols in brackets are those of the paper.
+`make generate` writes this page. Symbols in brackets are those of the paper.
 
 ## Those that people set
 
 """
-OTHERS_HEAD = """
-## The others
+ALL_PARAMETERS = """
+## All of them
 
+[config/default.yaml](../config/default.yaml) has every parameter with its meaning, range and unit.
+
+```{literalinclude} ../config/default.yaml
+:language: yaml
+```
 """
 REMOVED_HEAD = """
 ## Removed
@@ -34,14 +38,14 @@ out, and warn. Topics begin with `~/`: a subscriber of one gets no message.
 """
 
 
-def to_markdown_table(*, basic: bool) -> str:
-    """Write the parameters that are basic, or the others, one row each, in their order."""
+def to_markdown_table() -> str:
+    """Write the parameters that people set, one row each, in their order."""
     rows = [
         ('Parameter', 'Default', 'Accepted', 'Meaning'),
         ('---', '---', '---', '---'),
     ]
     for spec in parameter_specs():
-        if spec.basic == basic:
+        if spec.basic:
             name, default = f'`{spec.name}`', f'`{yaml_scalar(spec.default)}`'
             accepted = f'{accepted_values(spec)} {spec.unit}'.rstrip()
             symbol = f' (`{spec.symbol}`)' if spec.symbol else ''
@@ -119,8 +123,8 @@ def generated_files(readme: str) -> dict[str, str]:
     for name, instead in REMOVED.items():
         names.setdefault(instead, []).append(f'`{name}`')
     removed = ''.join(f'| {", ".join(own)} | {instead} |\n' for instead, own in names.items())
-    tables = OTHERS_HEAD.join(to_markdown_table(basic=basic) for basic in (True, False))
-    files['docs/parameters.md'] = PAGE_HEAD + tables + REMOVED_HEAD + removed
+    page = PAGE_HEAD + to_markdown_table() + ALL_PARAMETERS + REMOVED_HEAD + removed
+    files['docs/parameters.md'] = page
     return files
 
 

@@ -81,12 +81,11 @@ def test_generated_files_are_up_to_date():
     assert {f'config/{path.name}' for path in (REPOSITORY / 'config').glob('*.yaml')} <= set(files)
 
 
-@pytest.mark.parametrize('basic', [True, False])
-def test_tables_have_a_row_for_each_parameter(basic):
-    table = generate.to_markdown_table(basic=basic)
+def test_the_table_has_a_row_for_each_parameter_that_people_set():
+    table = generate.to_markdown_table()
     header, rule, *rows = table.splitlines()
     assert set(rule) <= set('| -')
-    specs = [spec for spec in parameter_specs() if spec.basic == basic]
+    specs = [spec for spec in parameter_specs() if spec.basic]
     for row, spec in zip(rows, specs, strict=True):
         cells = row.replace(r'\|', '\0').split('|')
         assert len(cells) == len(header.split('|'))
@@ -97,12 +96,13 @@ def test_tables_have_a_row_for_each_parameter(basic):
         assert cells[3] == spec.description + f' (`{spec.symbol}`)' * bool(spec.symbol)
 
 
-def test_the_page_of_parameters_has_both_tables_and_what_is_gone():
+def test_the_page_of_parameters_has_its_table_all_parameters_and_what_is_gone():
     files = generate.generated_files(''.join(generate.marks_of(generate.SCORES)))
     page, removed = files['docs/parameters.md'].split(generate.REMOVED_HEAD)
-    first, others = page.split(generate.OTHERS_HEAD)
-    assert first.endswith(generate.to_markdown_table(basic=True))
-    assert others == generate.to_markdown_table(basic=False)
+    table, _, listing = page.partition(generate.ALL_PARAMETERS)
+    assert table.endswith(generate.to_markdown_table()) and listing == ''
+    (path,) = re.findall('^```{literalinclude} (.*)$', page, re.MULTILINE)
+    assert (REPOSITORY / 'docs' / path).samefile(REPOSITORY / 'config' / 'default.yaml')
     shown = (line[2:-2].split(' | ') for line in removed.splitlines())
     found = [(name, use) for names, use in shown for name in names.split(', ')]
     assert sorted(found) == sorted((f'`{name}`', use) for name, use in REMOVED.items())
