@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import time
 
 import numpy as np
 import pytest
@@ -364,7 +365,7 @@ def test_the_wait_of_a_cloud_is_a_part_of_its_latency(b, monkeypatch):
     latencies = []
     task = b.node._diagnostics.processing
     monkeypatch.setattr(task, 'processed', lambda latency, _backend: latencies.append(latency))
-    b.in_executor(b.node._on_cloud, to_message(street(500)), 100.0, 0)
+    b.in_executor(b.node._on_cloud, to_message(street(500)), time.monotonic() - 100.0, 0)
     ros.wait_for(lambda: latencies, 'latency')
     assert 100.0 < latencies[0] < 130.0
 

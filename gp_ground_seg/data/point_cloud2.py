@@ -19,7 +19,7 @@ from numpy.lib.recfunctions import repack_fields
 from numpy.lib.stride_tricks import as_strided
 
 from gp_ground_seg.core.errors import PointCloudError, in_one_line
-from gp_ground_seg.core.pipeline.points import finite_points
+from gp_ground_seg.core.pipeline.points import finite_points, single_precision
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
 from gp_ground_seg.data.bags import jazzy_types
 from gp_ground_seg.data.clouds import check_numbers, distinct, gather
@@ -48,13 +48,16 @@ class CloudMessage(Protocol):
 Cloud = TypeVar('Cloud', bound=CloudMessage)
 
 
-def read_xyz(cloud: CloudMessage) -> npt.NDArray[np.float32] | npt.NDArray[np.float64]:
+def read_xyz(
+    cloud: CloudMessage, *, is_single: bool = False
+) -> npt.NDArray[np.float32] | npt.NDArray[np.float64]:
     """Coordinates of every point, row by row, in native byte order, (height * width, 3).
 
-    They may lie in the data of the cloud, read-only. float64 if any of the three is FLOAT64. Only
-    x, y and z are checked. A cloud of one row never uses ``row_step``, which must not exceed its
-    data; bytes after the last point are ignored. A cloud without points needs no fields. Raises
-    PointCloudError if the layout cannot hold what it claims.
+    They may lie in the data of the cloud, read-only. float64 if one of the three is FLOAT64 and
+    not `is_single`; what is finite stays finite. Only x, y and z are checked. A cloud of one row
+    never uses ``row_step``, which must not exceed its data; bytes after the last point are
+    ignored. A cloud without points needs no fields. Raises PointCloudError if the layout cannot
+    hold what it claims.
     """
     if cloud.height * cloud.width == 0:
         return np.empty((0, 3), dtype=np.float32)
@@ -65,13 +68,15 @@ def read_xyz(cloud: CloudMessage) -> npt.NDArray[np.float32] | npt.NDArray[np.fl
     if is_one_type and y - x == z - y == size:
         # Side by side, as most sensors write them.
         shape, strides = (*first.shape, 3), (*first.strides, size)
-        return as_strided(first, shape, strides, writeable=False).reshape(-1, 3)
-    wide = any(column.dtype.itemsize == 8 for column in columns)
-    # Arbitrary bytes may be a signalling NaN, one more value that is not finite.
-    with np.errstate(invalid='ignore'):
-        # Each coordinate is contiguous, as the segmentation reads it.
-        xyz = np.stack(columns, dtype=np.float64 if wide else np.float32)
-    return np.asarray(xyz.reshape(3, -1).T)
+        xyz = as_strided(first, shape, strides, writeable=False).reshape(-1, 3)
+    else:
+        wide = any(column.dtype.itemsize == 8 for column in columns)
+        # Arbitrary bytes may be a signalling NaN, one more value that is not finite.
+        with np.errstate(invalid='ignore'):
+            # Each coordinate is contiguous, as the segmentation reads it.
+            stacked = np.stack(columns, dtype=np.float64 if wide else np.float32)
+        xyz = stacked.reshape(3, -1).T
+    return single_precision(xyz) if is_single else xyz
 
 
 def read_columns(cloud: CloudMessage, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:

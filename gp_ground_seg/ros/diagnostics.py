@@ -12,12 +12,13 @@ import numpy as np
 import numpy.typing as npt
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
+from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.core.frame import FloatArray, Label
 from gp_ground_seg.core.parameters.config import DiagnosticsConfig
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.core.result import Segmentation
-from gp_ground_seg.ros.input import STEADY_CLOCK
+from gp_ground_seg.ros.input import STEADY_CLOCK, seconds_of
 
 RATE_WINDOW = 10.0  # time over which rates are taken [s]
 FIRST_LOG, LOG_PERIOD = 10.0, 60.0
@@ -331,6 +332,27 @@ class Diagnostics:
             self._timer.timer_period_ns = round(1e9 * limits.period)
             self._timer.reset()
         self._limits = limits
+
+    def arrived(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
+        """Count a cloud that came at the time `arrival` [s], and `n_lost` before it."""
+        fields = [field.name for field in cloud.fields]
+        self.input.arrived(arrival, seconds_of(cloud.header.stamp), cloud.header.frame_id, fields)
+        self.processing.arrived(n_lost)
+
+    def published(
+        self,
+        scan: Segmentation,
+        arrival: float,
+        stages: Mapping[str, float],
+        topics: Sequence[str],
+    ) -> None:
+        """Count the cloud that came at the time `arrival` [s]; log the times of its stages."""
+        now = time.monotonic()
+        times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
+        self._node.get_logger().debug(f'times of the stages [ms]: {times}')
+        self.processing.processed(now - arrival, scan.fit.backend)
+        self.model.segmented(scan)
+        self.output.published(now, topics)
 
     def report(self, now: float) -> list[Status]:
         """Return the status of each task."""

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from builtin_interfaces.msg import Time as TimeMessage
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
@@ -78,48 +79,62 @@ class SequenceGaps:
         return number - last - 1 if is_next else 0
 
 
+OnCloud = Callable[[PointCloud2, float, int], None]
+"""Takes a cloud, the time of ``time.monotonic`` at which it came [s], the number lost before."""
+
+
+def wanted_profile(node: Node, topic: str) -> QoSProfile:
+    """Declare ``qos_overrides`` of a subscription of clouds, and return the QoS that they give."""
+    default = QoSProfile(depth=INPUT_DEPTH, reliability=ReliabilityPolicy.BEST_AVAILABLE)
+    # rclpy declares them only where something subscribes.
+    subscription = node.create_subscription(
+        PointCloud2, topic, lambda _cloud: None, default,
+        qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+    )  # fmt: skip
+    profile: QoSProfile = subscription.qos_profile
+    node.destroy_subscription(subscription)
+    return profile
+
+
 class CloudSubscription:
     """Subscription that is best-effort while any publisher is, and reliable otherwise.
 
     A best-effort reader loses most of a replayed KITTI bag with stock Fast DDS; a reliable one
     gets nothing from a best-effort LiDAR driver. ROS decides between them when a subscription with
-    `ReliabilityPolicy.BEST_AVAILABLE` is made: it is made anew when the publishers change. A
-    reliability given in ``qos_overrides`` is kept for any publisher. `callback` takes a cloud, its
-    wait in this process [s] and the number of clouds lost before it. `why_idle` says why no
-    clouds are wanted: while it says something, there is no subscription.
+    `ReliabilityPolicy.BEST_AVAILABLE` is made: `review` makes it, at the start and anew when the
+    publishers change. A reliability given in ``qos_overrides`` is kept for any publisher.
+    `why_idle` says why no clouds are wanted: while it says something, there is no subscription.
+    `on_jump` is called as by `TimeJumps`.
     """
+
+    idle = ''
+    """Why no clouds are wanted, as of the last review."""
+    _subscription: Any = None
+    _reliability = ReliabilityPolicy.UNKNOWN
+    _large_size = 0
 
     def __init__(
         self,
         node: Node,
         topic: str,
-        callback: Callable[[PointCloud2, float, int], None],
+        callback: OnCloud,
         why_idle: Callable[[], str],
+        on_jump: Callable[[float], None],
     ) -> None:
         self._node = node
-        self._callback = callback
+        self.callback = callback
         self._why_idle = why_idle
+        self._jumps = TimeJumps(node, on_jump)
         self._gaps = SequenceGaps()
         self._offered: dict[bytes, ReliabilityPolicy] = {}
         self._foreign: set[str] = set()  # types of other messages that are sent on the topic
-        self._large_size = 0
         self._unresolved_topic = topic
         self.topic: str = node.resolve_topic_name(topic)
+        self._profile = wanted_profile(node, topic)
+        self._is_pinned = self._profile.reliability != ReliabilityPolicy.BEST_AVAILABLE
         # The executor still uses a subscription within its own event; a guard condition runs
         # after all that became ready with it.
         self._review_soon = node.create_guard_condition(self.review)
-        self._look_at_publishers()
-        self.idle = why_idle()
-        self._reliability = self._wanted_reliability()
-        self._profile = QoSProfile(depth=INPUT_DEPTH, reliability=ReliabilityPolicy.BEST_AVAILABLE)
-        self._create(QoSOverridingOptions.with_default_policies())
-        self._profile = self._subscription.qos_profile
-        self._is_pinned = self._profile.reliability != ReliabilityPolicy.BEST_AVAILABLE
-        if self._is_pinned:
-            self._reliability = self._profile.reliability
-        if self.idle:
-            # The parameters of its QoS are declared.
-            self._end()
         # The event can come before the publisher is listed, and there is no event for the end
         # of the last best-effort publisher: they are looked at every second too.
         node.create_timer(1.0, self._review_soon.trigger, clock=STEADY_CLOCK)
@@ -130,12 +145,6 @@ class CloudSubscription:
         history, durability = self._profile.history, self._profile.durability
         words = f'{self._reliability.name}, {history.name} {self._profile.depth}'
         return f'{words}, {durability.name}'.lower()
-
-    @property
-    def words(self) -> str:
-        """What it does, for the log."""
-        why = f'not listening to {self.topic}: {self.idle}'
-        return why if self.idle else f'listening to {self.topic} ({self.qos_words})'
 
     @property
     def n_publishers(self) -> int:
@@ -168,14 +177,13 @@ class CloudSubscription:
             'FASTRTPS_DEFAULT_PROFILES_FILE=config/fastdds_large_clouds.xml'
         )
 
-    def _create(self, overrides: QoSOverridingOptions | None = None) -> None:
-        self._subscription: Any = self._node.create_subscription(
+    def _create(self) -> None:
+        self._subscription = self._node.create_subscription(
             PointCloud2,
             self._unresolved_topic,
             self._receive,
             self._profile,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible),
-            qos_overriding_options=overrides,
         )
 
     def _end(self) -> None:
@@ -191,10 +199,11 @@ class CloudSubscription:
             n_lost = 0  # the numbers are those of another publisher
         if self._reliability == ReliabilityPolicy.BEST_EFFORT:
             self._check_size(len(cloud.data))
+        self._jumps.note(seconds_of(cloud.header.stamp))
         # Both are stamps of the system clock; 0 where the middleware gives none.
         now = time.time_ns()
         wait = max(0.0, 1e-9 * (now - (info.get('received_timestamp') or now)))
-        self._callback(cloud, wait, n_lost)
+        self.callback(cloud, time.monotonic() - wait, n_lost)
 
     def _check_size(self, size: int) -> None:
         if size > LARGE_CLOUD:
@@ -224,14 +233,16 @@ class CloudSubscription:
         return is_changed
 
     def _wanted_reliability(self) -> ReliabilityPolicy:
-        """Return what BEST_AVAILABLE is for the publishers of the last look."""
+        """Return what is pinned, or what BEST_AVAILABLE is for the publishers of the last look."""
+        if self._is_pinned:
+            return self._profile.reliability
         is_any = ReliabilityPolicy.BEST_EFFORT in self._offered.values()
         return ReliabilityPolicy.BEST_EFFORT if is_any else ReliabilityPolicy.RELIABLE
 
     def review(self) -> None:
-        """Subscribe as the publishers offer, or not at all, as clouds are wanted now."""
+        """Subscribe as the publishers offer, or not at all, as clouds are wanted now; log it."""
         self._look_at_publishers()
-        wanted = self._reliability if self._is_pinned else self._wanted_reliability()
+        wanted = self._wanted_reliability()
         self.idle = self._why_idle()
         is_listening = self._subscription is not None
         if is_listening != bool(self.idle) and wanted == self._reliability:
@@ -239,14 +250,21 @@ class CloudSubscription:
         if is_listening:
             self._end()
         self._reliability, self._large_size = wanted, 0
+        words = f'not listening to {self.topic}: {self.idle}'
         if not self.idle:
             self._create()
-        self._node.get_logger().info(self.words)
+            words = f'listening to {self.topic} ({self.qos_words})'
+        self._node.get_logger().info(words)
 
 
 def cloud_profile(depth: int = OUTPUT_DEPTH) -> QoSProfile:
     """Return the default of a topic on which clouds are sent: reliable, volatile, the newest."""
     return QoSProfile(depth=depth)
+
+
+def seconds_of(stamp: TimeMessage) -> float:
+    """Return the time of a header [s]."""
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
 def clock_fault(clock: Clock) -> str:

@@ -20,17 +20,21 @@ from gp_ground_seg.core.backend import NumpyBackend, choose_backend
 from gp_ground_seg.core.errors import GroundSegError, PointCloudError, in_one_line, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.core.pipeline.points import single_precision
-from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.ros import start_stop
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts, kept_height
-from gp_ground_seg.ros.input import THROTTLED, CloudSubscription, TimeJumps, clock_fault
+from gp_ground_seg.ros.input import THROTTLED, CloudSubscription, clock_fault
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
-from gp_ground_seg.ros.transforms import KeptPose, TfListener, is_tf_used, require_tf2
+from gp_ground_seg.ros.transforms import (
+    CloudFrames,
+    KeptPose,
+    TfListener,
+    is_tf_used,
+    require_tf2,
+)
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader
 
 
@@ -70,80 +74,56 @@ class GroundSegmentationNode(ConfiguredNode):
         logger.info(describe(self.config, self.get_fully_qualified_name()))
         with start_stop.start_errors():
             self._outputs = OutputPublishers(self)
-            self._input = CloudSubscription(self, 'points', self._on_cloud, self._why_idle)
+            self._input = CloudSubscription(
+                self, 'points', self._on_cloud, self._why_idle, self._on_time_jump
+            )
         self._follow_tf(self.config)
-        self._time_jumps = TimeJumps(self, self._on_time_jump)
         self._diagnostics = Diagnostics(self, self._state, self.config.diagnostics)
         self.warn_of_unused_parameters()
         self._load_backend(self.config)
-        logger.info(self._input.words)
+        self._input.review()
 
-    def _on_cloud(self, cloud: PointCloud2, wait: float, n_lost: int) -> None:
-        """Process a cloud, once TF has the transforms that it needs."""
-        arrival = time.monotonic()
-        self._note_arrival(cloud, arrival, n_lost)
+    def _on_cloud(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
+        """Read a cloud, segment it, publish the result, and note it; or say why it is refused.
 
-        def process_late() -> None:
-            if not self._why_idle():
-                self._process(cloud, wait + time.monotonic() - arrival)
-
-        if self._tf is None:
-            self._process(cloud, wait)
-        else:
-            self._tf.when_known(cloud.header, self.config, process_late)
-
-    def _process(self, cloud: PointCloud2, wait: float) -> None:
-        """Segment a cloud and publish the result; report a cloud that cannot be segmented."""
-        start = time.monotonic()
+        It came at the time `arrival` of ``time.monotonic`` [s], and `n_lost` before it did not.
+        """
+        if self._input.idle:
+            return  # it has waited for TF, and is not wanted any more
+        start, header = time.monotonic(), cloud.header
+        self._diagnostics.arrived(cloud, arrival, n_lost)
         try:
-            segmentation = self._segment(cloud)
-            segmented, frame = time.monotonic(), self.config.output.frame
-            placement = self._tf.placement(cloud.header, frame) if self._tf else None
+            # Code for the other precision would have to be compiled at the first start too.
+            points = read_xyz(cloud, is_single=True)
+            frames = self._tf.look_up(header) if self._tf else CloudFrames()
+            fallback = self._kept.fallback(header.frame_id)
+            result = self._segmenter.segment(points, frames.tilt, frames.origin, fallback)
+            if self._kept.note(result.pose):
+                text = f'on {self._input.topic}, {kept_height(result.pose)}'
+                self.get_logger().warning(text, **THROTTLED)
+            segmented = time.monotonic()
             topics = self._outputs.publish(
-                SegmentedCloud(cloud, segmentation, self.config, placement)
+                SegmentedCloud(cloud, result, self.config, frames.output)
             )
-        except PointCloudError as error:
-            self._refuse(cloud, str(error))
         except Exception as error:
             # The next cloud may be good.
-            self._refuse(cloud, f'{type(error).__name__}: {in_one_line(error)}')
-        else:
-            end, health = time.monotonic(), self._diagnostics
-            stages = {'queue': wait, **segmentation.timings, 'publish': end - segmented}
-            times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
-            self.get_logger().debug(f'times of the stages [ms]: {times}')
-            health.processing.processed(wait + end - start, segmentation.fit.backend)
-            health.model.segmented(segmentation)
-            health.output.published(end, topics)
+            self._refuse(cloud, error)
+            return
+        publishing = time.monotonic() - segmented
+        stages = {'queue': start - arrival, **result.timings, 'publish': publishing}
+        self._diagnostics.published(result, arrival, stages, topics)
 
     def _why_idle(self) -> str:
         """Why no clouds are wanted now; empty if they are."""
         is_heard = not self.config.input.lazy or any(self._outputs.n_subscribers().values())
         return '' if is_heard else 'no output has a subscriber (input.lazy)'
 
-    def _note_arrival(self, cloud: PointCloud2, now: float, n_lost: int) -> None:
-        stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
-        fields = [field.name for field in cloud.fields]
-        self._time_jumps.note(stamp)
-        self._diagnostics.input.arrived(now, stamp, cloud.header.frame_id, fields)
-        self._diagnostics.processing.arrived(n_lost)
-
-    def _segment(self, cloud: PointCloud2) -> Segmentation:
-        """Return the segmentation of a cloud; raise a PointCloudError if it has none."""
-        # Code for the other precision would have to be compiled at the first start too.
-        points = single_precision(read_xyz(cloud))
-        tilt, origin = self._tf.look_up(cloud.header, self.config) if self._tf else (None, None)
-        fallback = self._kept.fallback(cloud.header.frame_id)
-        segmentation = self._segmenter.segment(points, tilt, origin, fallback)
-        if self._kept.note(segmentation.pose):
-            text = f'on {self._input.topic}, {kept_height(segmentation.pose)}'
-            self.get_logger().warning(text, **THROTTLED)
-        return segmentation
-
-    def _refuse(self, cloud: PointCloud2, reason: str) -> None:
+    def _refuse(self, cloud: PointCloud2, error: Exception) -> None:
         if not self.context.ok():
             return  # publishing failed because the process ends
-        reason = shown(reason)  # it may hold names of frames and fields
+        is_bad = isinstance(error, PointCloudError)
+        said = str(error) if is_bad else f'{type(error).__name__}: {in_one_line(error)}'
+        reason = shown(said)  # it may hold names of frames and fields
         self._diagnostics.input.refused(reason)
         self.get_logger().error(
             f'cloud on {self._input.topic} in frame {cloud.header.frame_id!r} refused: {reason}',
@@ -193,12 +173,14 @@ class GroundSegmentationNode(ConfiguredNode):
         self._segmenter.configure(self.config)
 
     def _follow_tf(self, config: Config) -> None:
-        """Listen to TF while the parameters ask for it."""
+        """Listen to TF while the parameters ask for it; clouds wait for it then."""
         if is_tf_used(config):
-            self._tf = self._tf or TfListener(self, config)
+            self._tf = self._tf or TfListener(self, config, self._on_cloud)
+            self._tf.config = config
         elif self._tf is not None:
             self._tf.close()
             self._tf = None
+        self._input.callback = self._tf.hold if self._tf else self._on_cloud
 
     @property
     def is_compiling(self) -> bool:

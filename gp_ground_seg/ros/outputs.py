@@ -14,7 +14,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 from std_msgs.msg import Header
 
-from gp_ground_seg.core.frame import NOT_FINITE, BoolArray
+from gp_ground_seg.core.frame import NOT_FINITE
 from gp_ground_seg.core.pipeline.points import rotate
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.costmap import (
@@ -33,7 +33,7 @@ from gp_ground_seg.data.point_cloud2 import (
     write_xyz,
 )
 from gp_ground_seg.ros.ground_model import ground_model_cloud
-from gp_ground_seg.ros.input import cloud_profile
+from gp_ground_seg.ros.input import cloud_profile, seconds_of
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
@@ -87,16 +87,13 @@ def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud
     return message
 
 
-def _selected(segmented: SegmentedCloud, chosen: BoolArray) -> PointCloud2:
-    """Return the `chosen` points in the output frame."""
-    # Ground and obstacles are finite points.
-    message = select_points(segmented.cloud, chosen, message_bytes, are_finite=True)
-    if segmented.placement is not None:
-        rotation, translation = segmented.placement
-        message.header = _header(segmented)
-        xyz = rotate(read_xyz(message).astype(np.float64), rotation)
-        write_xyz(message, xyz + translation)
-    return message
+def _move_points(message: PointCloud2, segmented: SegmentedCloud) -> None:
+    """Move points of the cloud to the output frame."""
+    assert segmented.placement is not None
+    rotation, translation = segmented.placement
+    message.header = _header(segmented)
+    xyz = rotate(read_xyz(message).astype(np.float64), rotation)
+    write_xyz(message, xyz + translation)
 
 
 def _header(segmented: SegmentedCloud) -> Header:
@@ -140,8 +137,19 @@ LABELLED = Output(
     '~/labeled', PointCloud2, lambda s: labelled_cloud(s.cloud, s.segmentation), True
 )
 OUTPUTS = (
-    Output('ground', PointCloud2, lambda s: _selected(s, s.is_ground), False),
-    Output('obstacles', PointCloud2, lambda s: _selected(s, s.is_obstacle), False),
+    # Ground and obstacles are finite points.
+    Output(
+        'ground',
+        PointCloud2,
+        lambda s: select_points(s.cloud, s.is_ground, message_bytes, are_finite=True),
+        False,
+    ),
+    Output(
+        'obstacles',
+        PointCloud2,
+        lambda s: select_points(s.cloud, s.is_obstacle, message_bytes, are_finite=True),
+        False,
+    ),
     LABELLED,
     Output(
         '~/ground_model',
@@ -174,14 +182,17 @@ class OutputPublishers:
 
     def publish(self, segmented: SegmentedCloud) -> list[str]:
         """Publish all outputs of a cloud, or none if one cannot be built; return their topics."""
-        stamp = segmented.cloud.header.stamp
-        seconds = stamp.sec + 1e-9 * stamp.nanosec
+        seconds = seconds_of(segmented.cloud.header.stamp)
         period, self._stamp = seconds - self._stamp, seconds
         messages = [
             (output, publisher, output.build(segmented))
             for output, publisher in self._publishers
             if not output.is_optional or publisher.get_subscription_count() > 0
         ]
+        if segmented.placement is not None:
+            # The optional ones are built in the output frame.
+            for message in (m for output, _, m in messages if not output.is_optional):
+                _move_points(message, segmented)
         for output, publisher, message in messages:
             if output is LABELLED:
                 self._warn_of_renamed(segmented.cloud)

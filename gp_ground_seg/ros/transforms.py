@@ -6,12 +6,14 @@ import importlib
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import Quaternion
 from rclpy.node import Node
 from rclpy.time import Time
+from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from gp_ground_seg.core.errors import MissingDependencyError, PointCloudError
@@ -20,7 +22,7 @@ from gp_ground_seg.core.parameters.config import NO_FRAME, Config
 from gp_ground_seg.core.pipeline.points import angles_of
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.data.costmap import Placement
-from gp_ground_seg.ros.input import STEADY_CLOCK
+from gp_ground_seg.ros.input import STEADY_CLOCK, OnCloud
 
 KEPT_JUMP = 1.0  # jump back up to which transforms are kept: a late stamp, no other run [s]
 MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]
@@ -74,42 +76,56 @@ def is_tf_used(config: Config) -> bool:
     return frame.level == 'tf' or {frame.sensor, config.output.frame} != {NO_FRAME}
 
 
-class TfListener:
-    """Listens to TF in the executor of `node`, for what `config` asks."""
+class CloudFrames(NamedTuple):
+    """What is known of the frame of a cloud; None for what nobody has asked for."""
 
-    def __init__(self, node: Node, config: Config) -> None:
+    tilt: tuple[float, float] | None = None  # roll and pitch of the sensor [rad]
+    origin: tuple[float, float, float] | None = None  # place of the sensor in it [m]
+    output: Placement | None = (
+        None  # where ``output.frame`` is; None also if it is that of the cloud
+    )
+
+
+class TfListener:
+    """Listens to TF in the executor of `node`, for what `config` asks.
+
+    Clouds come to `hold`, which passes each on to `use`, in their order, as soon as all transforms
+    of its stamp are known, or after `MAX_WAIT`. TF comes to the same executor: a callback cannot
+    wait for it.
+    """
+
+    def __init__(self, node: Node, config: Config, use: OnCloud) -> None:
+        self.config = config
         self._tf2_ros = require_tf2(config)
         # Without the node: given one, the buffer clears itself at jumps of the node's clock,
         # and in some releases raises an error there that ends the executor. See `time_jumped`.
         self._buffer = self._tf2_ros.Buffer()
         self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
-        self._waiting: deque[tuple[float, Header, Config, Callable[[], None]]] = deque()
-        self._node = node
+        self._waiting: deque[tuple[float, Header, Callable[[], None]]] = deque()
+        self._node, self._use = node, use
         self._timer = node.create_timer(REVIEW_PERIOD, self._review, clock=STEADY_CLOCK)
         self._timer.cancel()
 
-    def when_known(self, header: Header, config: Config, use: Callable[[], None]) -> None:
-        """Call `use` as soon as all transforms of a cloud are known, or after `MAX_WAIT`.
-
-        Clouds keep their order. TF comes to the same executor: it cannot be waited for here.
-        """
-        self._waiting.append((time.monotonic() + MAX_WAIT, header, config, use))
+    def hold(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
+        """Keep a cloud until its transforms are known."""
+        use = partial(self._use, cloud, arrival, n_lost)
+        self._waiting.append((time.monotonic() + MAX_WAIT, cloud.header, use))
         self._review()
 
     def _review(self) -> None:
         while self._waiting:
-            deadline, header, config, use = self._waiting[0]
-            if time.monotonic() < deadline and not self._is_known(header, config):
+            deadline, header, use = self._waiting[0]
+            if time.monotonic() < deadline and not self._is_known(header):
                 self._timer.reset()
                 return
             self._waiting.popleft()
             use()
         self._timer.cancel()
 
-    def _is_known(self, header: Header, config: Config) -> bool:
-        wanted = {config.frame.sensor, config.output.frame}
-        if config.frame.level == 'tf':
-            wanted.add(config.frame.base)
+    def _is_known(self, header: Header) -> bool:
+        wanted = {self.config.frame.sensor, self.config.output.frame}
+        if self.config.frame.level == 'tf':
+            wanted.add(self.config.frame.base)
         try:
             for frame in wanted - {NO_FRAME, header.frame_id}:
                 self._exact(frame, header.frame_id, header)
@@ -119,15 +135,13 @@ class TfListener:
             return True  # no such time: the cloud is refused with the reason
         return True
 
-    def look_up(
-        self, header: Header, config: Config
-    ) -> tuple[tuple[float, float] | None, tuple[float, float, float] | None]:
-        """Return tilt [rad] and place [m] of the sensor in a cloud; None for what is not asked.
+    def look_up(self, header: Header) -> CloudFrames:
+        """Return what is known of the frame of a cloud.
 
-        Those of the stamp, or the newest if TF does not reach it. Raises a PointCloudError if TF
-        does not have them.
+        Tilt and place of the sensor are those of the stamp, or the newest if TF does not reach it.
+        Raises a PointCloudError if TF does not have what is asked for.
         """
-        tilt, origin, frame_id, frame = None, None, header.frame_id, config.frame
+        tilt, origin, frame_id, frame = None, None, header.frame_id, self.config.frame
         if frame.level == 'tf':
             way = f'from its frame {frame_id!r} to frame.base = {frame.base!r}'
             tilt = tilt_of(self._newest(frame.base, frame_id, header, way).rotation)
@@ -137,13 +151,10 @@ class TfListener:
             origin = place.x, place.y, place.z
             if not np.isfinite(origin).all():
                 raise PointCloudError(f'transform {way}: its translation is {origin}')
-        return tilt, origin
+        return CloudFrames(tilt, origin, self._output(header))
 
-    def placement(self, header: Header, frame: str) -> Placement | None:
-        """Return where the `frame` of the outputs is at the stamp of a cloud.
-
-        None if it is that of the cloud. Raises a PointCloudError if TF does not have it.
-        """
+    def _output(self, header: Header) -> Placement | None:
+        frame = self.config.output.frame
         if frame in (NO_FRAME, header.frame_id):
             return None
         way = f'from its frame {header.frame_id!r} to output.frame = {frame!r}'
