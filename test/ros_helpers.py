@@ -33,8 +33,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg.core.backend import choose_backend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.ros.node import GroundSegmentationNode, main
-from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS
+from gp_ground_seg.ros.node import CHANGED, FOLLOWS, GroundSegmentationNode, main
 
 PATIENCE = 120.0
 """Time to wait for what has to happen [s]; only a failure takes that long."""

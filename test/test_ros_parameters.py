@@ -21,7 +21,7 @@ from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.config import PRESETS, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.export import file_problems
 from gp_ground_seg.core.parameters.removed import REMOVED
-from gp_ground_seg.ros.warm_up import CHANGED
+from gp_ground_seg.ros.node import CHANGED
 
 TYPES = {
     bool: ParameterType.PARAMETER_BOOL,

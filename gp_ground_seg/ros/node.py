@@ -1,11 +1,14 @@
-"""The ROS 2 node: clouds in, ground and obstacles out."""
+"""The ROS 2 node: clouds in, ground and obstacles out; compiled code is made meanwhile."""
 
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import logging
 import os
+import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -16,11 +19,12 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.core import log
-from gp_ground_seg.core.backend import NumpyBackend, choose_backend
+from gp_ground_seg.core.backend import Backend, NumpyBackend, choose_backend
 from gp_ground_seg.core.errors import GroundSegError, PointCloudError, in_one_line, shown
+from gp_ground_seg.core.jit import code_folder, is_code_kept
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.core.segmenter import GroundSegmenter
+from gp_ground_seg.core.segmenter import GroundSegmenter, warm_up
 from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.ros import start_stop
@@ -28,6 +32,7 @@ from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts, kept_height
 from gp_ground_seg.ros.input import THROTTLED, CloudSubscription, clock_fault
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
+from gp_ground_seg.ros.start_stop import child_command
 from gp_ground_seg.ros.transforms import (
     CloudFrames,
     KeptPose,
@@ -35,7 +40,18 @@ from gp_ground_seg.ros.transforms import (
     is_tf_used,
     require_tf2,
 )
-from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader
+
+FOLLOWS = (
+    'segmenting with numpy until the compiled code is there: a second, or 20 to 60 s to compile it'
+)
+CHANGED = 'segmenting with numba now'
+STAYS = 'segmenting with numpy from now on'
+JOIN_TIMEOUT = 0.5  # longest wait for the thread [s]
+
+# Looking for garbage less often, as the commands do, saves a tenth of the time.
+_COMPILE = 'import gc; gc.set_threshold(50_000); ' + (
+    'from gp_ground_seg.core.segmenter import warm_up; warm_up()'
+)
 
 
 class GroundSegmentationNode(ConfiguredNode):
@@ -213,6 +229,103 @@ class GroundSegmentationNode(ConfiguredNode):
             source.idle,
         )  # fmt: skip
         return facts, self._outputs.n_subscribers()
+
+
+class BackendLoader:
+    """Makes the compiled backend in a thread, while frames are segmented without it.
+
+    `on_done` is called there when the backend is made or cannot be made; not after `stop`.
+    """
+
+    error = ''
+    seconds = 0.0
+    is_ready = False
+    """Whether `take_backend` has a result that was not taken yet."""
+    _backend: Backend | None = None
+    _is_stopped = False
+    _compiler: subprocess.Popen[bytes] | None = None
+    _thread: threading.Thread | None = None
+
+    def __init__(self, on_done: Callable[[], None]) -> None:
+        self._on_done = on_done
+        self._lock = threading.Lock()
+
+    @property
+    def is_started(self) -> bool:
+        """Whether `start` has been called."""
+        return self._thread is not None
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(self, config: Config) -> None:
+        """Begin to make the backend for `config`."""
+        self._thread = threading.Thread(target=self._run, args=(config,), daemon=True)
+        self._thread.start()
+
+    def take_backend(self) -> Backend | None:
+        """Return the backend, once; None if it cannot be made, and `error` says why."""
+        backend, self._backend, self.is_ready = self._backend, None, False
+        return backend
+
+    def stop(self) -> None:
+        """End the compiling process; `on_done` is not called from now on."""
+        with self._lock:
+            self._is_stopped = True
+            if self._compiler is not None:
+                self._compiler.kill()
+
+    def close(self) -> None:
+        """Stop, and wait for the thread.
+
+        A thread that compiles in this process, as where no folder can keep the code, does so for
+        20 to 60 s: nobody waits for it.
+        """
+        self.stop()
+        if self._thread is not None:
+            self._thread.join(JOIN_TIMEOUT)
+
+    def _run(self, config: Config) -> None:
+        start = time.monotonic()
+        backend = None
+        try:
+            # What is kept is known once the compiled functions are declared.
+            importlib.import_module('gp_ground_seg.core.compiled.backend')
+            if code_folder() is not None and not is_code_kept():
+                self._compile()
+            if not self._is_stopped:
+                # A given height is not that of the scan which is segmented for this.
+                backend = warm_up(dataclasses.replace(config, sensor=Config().sensor))
+        except Exception as error:
+            self.error = f'{type(error).__name__}: {error}'
+        self.seconds = time.monotonic() - start
+        with self._lock:
+            if not self._is_stopped:
+                self._backend, self.is_ready = backend, True
+                self._on_done()
+
+    def _compile(self) -> None:
+        """Compile in a child process, whose memory is free after it: twice what the node needs."""
+        with self._lock:
+            if self._is_stopped:
+                return
+            pipe, nowhere = subprocess.PIPE, subprocess.DEVNULL
+            self._compiler = subprocess.Popen(
+                child_command(_COMPILE),
+                cwd='/',
+                stdin=pipe,
+                stdout=nowhere,
+                stderr=pipe,
+            )
+        with self._compiler:
+            assert self._compiler.stderr is not None
+            said = self._compiler.stderr.read().decode(errors='replace').strip()
+            code = self._compiler.wait()
+        if code and not self._is_stopped:
+            reason = said.splitlines()[-1] if said else f'exit code {code}'
+            raise RuntimeError(f'the compiling process failed: {reason}')
 
 
 def _spin(node: GroundSegmentationNode, stop: start_stop.StopRequest) -> None:

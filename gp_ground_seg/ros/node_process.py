@@ -72,7 +72,7 @@ class NodeProcess:
 
     def is_settled(self) -> bool:
         """Return whether it has the backend that it keeps."""
-        from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS
+        from gp_ground_seg.ros.node import CHANGED, FOLLOWS, STAYS
 
         said = self._said()
         return FOLLOWS not in said or CHANGED in said or STAYS in said
