@@ -16,6 +16,11 @@ def accepted_values(spec):
         return st.from_regex(r'[A-Za-z0-9_./-]{1,20}', fullmatch=True)
     if spec.type is bool:
         return st.booleans()
+    if spec.type is tuple:
+        bound = st.floats(spec.minimum, spec.maximum)
+        side = st.tuples(bound, bound).filter(lambda ab: ab[0] < ab[1])
+        boxes = st.tuples(side, side, side).map(lambda sides: sides[0] + sides[1] + sides[2])
+        return st.one_of(st.just('none'), boxes)
     if spec.type is int:
         return st.integers(int(spec.minimum), int(spec.maximum))
     numbers = st.floats(spec.minimum, spec.maximum)

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import pickle
 import re
+from array import array
 
 import numpy as np
 import pytest
@@ -30,7 +31,8 @@ def by_name(spec):
 
 
 def is_of_declared_type(spec, value):
-    return type(value) is spec.type or (spec.auto and value == 'auto')
+    no_number = {float: 'auto' if spec.auto else None, tuple: 'none'}
+    return type(value) is spec.type or value == no_number.get(spec.type, 0)
 
 
 @pytest.fixture
@@ -52,6 +54,8 @@ def test_declarations_are_complete(spec):
     if spec.type in (int, float):
         assert -math.inf < spec.minimum < spec.maximum < math.inf
         assert spec.choices == ()
+    elif spec.type is tuple:
+        assert spec.minimum < spec.maximum
     else:
         assert (
             spec.type is bool
@@ -66,10 +70,10 @@ def test_declarations_are_complete(spec):
 
 def test_the_basic_parameters():
     """Those at the top of docs/parameters.md; changing this list changes what users see first."""
-    assert len(SPECS) == 69
+    assert len(SPECS) == 70
     assert [spec.name for spec in SPECS if spec.basic] == [
         'sensor.height', 'sensor.roll', 'sensor.pitch', 'frame.level', 'frame.base',
-        'grid.n_segments', 'grid.r_max', 'growth.seed_height_tolerance',
+        'input.crop_box', 'grid.n_segments', 'grid.r_max', 'growth.seed_height_tolerance',
         'label.ground_tolerance', 'learning.mode',
     ]  # fmt: skip
 
@@ -102,6 +106,23 @@ def test_numbers_refuse_what_is_none_or_out_of_range(spec):
         whole = math.ceil(spec.minimum)
         assert whole > spec.maximum or type(spec.check(whole)) is float
         assert type(spec.check(np.float64(spec.minimum))) is float
+
+
+BOX = -1.0, 0.5, -0.4, 0.4, -0.5, 1.0
+
+
+def test_a_box_is_six_numbers_or_none():
+    spec = find_spec('input.crop_box')
+    mixed = '[-1, 0.5, -0.4, 0.4, -0.5, 1]'  # as ros2 param set sends it
+    for value in (BOX, list(BOX), np.array(BOX), array('d', BOX), mixed):
+        assert spec.check(value) == BOX
+    assert spec.check([-1, 1, -2, 2, -3, 3]) == (-1.0, 1.0, -2.0, 2.0, -3.0, 3.0)
+    assert spec.check('none') == spec.check([]) == spec.default == 'none'
+    swapped = 0.5, -1.0, *BOX[2:]
+    for value in (BOX[:5], (*BOX, 1.0), swapped, (*BOX[:5], math.nan), (*BOX[:5], 101.0),
+                  (*BOX[:5], True), (*BOX[:5], '1'), 'None', '[1', 1.0, None, True):  # fmt: skip
+        with pytest.raises(ConfigError, match=r'^input\.crop_box = .*: must be none or six num'):
+            spec.check(value)
 
 
 def test_groups_given_whole_are_checked_and_converted():

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from conftest import simulated
 
+from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.pipeline import points
 
@@ -88,3 +89,47 @@ def test_places_that_many_points_share_are_sensors():
         np.testing.assert_array_equal(empty, shared & (spot < 2) & (share > 0.03))
     few = np.tile(places[:1], (999, 1))
     assert np.isfinite(points.take_points(few, (0.0, 0.0, 0.0))).all()
+
+
+BOX = -2.0, 1.0, -0.8, 0.8, -1.5, 0.5
+VALUES = {'learning.mode': 'fixed', 'input.crop_box': BOX}
+
+
+def scan_with_own_body(dtype=np.float32):
+    """A scan with a thousand returns of the robot's own body, in `BOX`; which points are in it."""
+    scan = simulated('urban', seed=1).points[:, :3]
+    body = np.random.default_rng(0).uniform(BOX[::2], BOX[1::2], (1000, 3))
+    cloud = np.concatenate([body, scan]).astype(dtype)
+    return cloud, ((cloud >= BOX[::2]) & (cloud <= BOX[1::2])).all(axis=1)
+
+
+@pytest.mark.parametrize('backend', ['numpy', 'numba'])
+def test_points_in_the_crop_box_are_no_returns(backend):
+    cloud, is_body = scan_with_own_body()
+    config = Config().replace(**{'runtime.backend': backend, **VALUES})
+    before = cloud.copy()
+    found = GroundSegmenter(config).segment(cloud)
+    np.testing.assert_array_equal(cloud, before)
+    # In no class, without a height, and nothing else hangs on them.
+    np.testing.assert_array_equal(found.label == Label.UNKNOWN, is_body)
+    assert np.isnan(found.height[is_body]).all()
+    without = config.replace(**{'input.crop_box': 'none'})
+    expected = GroundSegmenter(without).segment(cloud[~is_body])
+    assert found.pose == expected.pose
+    for name in ('label', 'height', 'ground_z', 'ground_std', 'p_ground'):
+        np.testing.assert_array_equal(getattr(found, name)[~is_body], getattr(expected, name))
+
+
+def test_the_crop_box_may_be_in_another_frame():
+    cloud, is_body = scan_with_own_body(np.float64)
+    turn, move = points.rotation(0.2, -0.3), np.array([1.0, -2.0, 0.5])
+    moved = (cloud - move) @ turn  # in the frame of the box it is R p + t
+    config = Config().replace(**{'runtime.backend': 'numpy', **VALUES})
+    found = GroundSegmenter(config).segment(moved, (0.2, -0.3), box_frame=(turn, move))
+    np.testing.assert_array_equal(found.label == Label.UNKNOWN, is_body)
+
+
+def test_without_a_point_in_the_box_nothing_is_copied():
+    cloud, is_body = scan_with_own_body()
+    outside = cloud[~is_body]
+    assert points.without_box(outside, BOX, None) is outside

@@ -25,11 +25,11 @@ from test_sensor_pose import ROOM
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.core.pipeline.points import rotation
+from gp_ground_seg.core.pipeline.points import angles_of, rotation
 from gp_ground_seg.lab.simulation import VLP_16, simulate_scan
 from gp_ground_seg.ros import transforms
 from gp_ground_seg.ros.ground_model import read_ground_model
-from gp_ground_seg.ros.transforms import tilt_of
+from gp_ground_seg.ros.transforms import rotation_of
 
 HAS_TF2 = importlib.util.find_spec('tf2_ros') is not None
 VALUES = {'learning.mode': 'fixed', 'sensor.height': 1.73}
@@ -68,7 +68,7 @@ def check_levelled(points, message, parts):
 @given(st.floats(-3.14, 3.14), st.floats(-1.5, 1.5), st.floats(-3.14, 3.14))
 def test_tilt_of_a_quaternion_is_roll_and_pitch_whatever_the_heading(roll, pitch, yaw):
     turn = Rotation.from_euler('z', yaw).as_matrix() @ rotation(roll, pitch)
-    found = tilt_of(quaternion(turn))
+    found = angles_of(rotation_of(quaternion(turn))[2])
     # As rotations: at the ends of the range angles jump, what they mean does not.
     np.testing.assert_allclose(rotation(*found), rotation(roll, pitch), atol=3e-5)
     fixed_axes = Rotation.from_matrix(turn).as_euler('xyz')[:2]
@@ -78,7 +78,7 @@ def test_tilt_of_a_quaternion_is_roll_and_pitch_whatever_the_heading(roll, pitch
 @pytest.mark.parametrize('w', [0.0, 2.0, math.nan])
 def test_what_is_no_rotation_is_refused(w):
     with pytest.raises(PointCloudError, match='quaternion'):
-        tilt_of(Quaternion(x=0.0, w=w))
+        rotation_of(Quaternion(x=0.0, w=w))
 
 
 @pytest.mark.skipif(HAS_TF2, reason='tf2_ros is installed')
@@ -286,6 +286,24 @@ def test_place_of_the_sensor_by_tf():
         assert b.set('frame.sensor', 'none').successful
         assert StandInListener.alive == n_alive - 1
         assert b.segment(message)[0].width == 0
+
+
+@pytest.mark.usefixtures('stand_in')
+def test_the_crop_box_is_in_the_base_of_tf(monkeypatch):
+    points, turn = turned_street(yaw=1.0)
+    place = np.array([0.5, -0.3, 1.73])
+    box = np.array([-9.0, 9.0, -5.0, 6.0, -0.5, 2.0])
+    monkeypatch.setattr(StandInBuffer, 'known', {('base_link', 'tilted_lidar'): quaternion(turn)})
+    monkeypatch.setattr(StandInBuffer, 'place', tuple(place))
+    in_base = xyz_of(points).astype(np.float64) @ turn.T + place
+    inside = ((in_base > box[::2]) & (in_base < box[1::2])).all(axis=1)
+    values = {**VALUES, 'frame.level': 'tf', 'input.crop_box': box.tolist()}
+    message = to_message(points, stamp=(3, 4), frame='tilted_lidar')
+    rows = ros.rows_of(message)
+    with bench(*ros.given(values)) as b:
+        found = sorted(row for part in b.segment(message) for row in ros.rows_of(part))
+    assert 200 < inside.sum() < 3000
+    assert found == sorted(row for row, is_body in zip(rows, inside, strict=True) if not is_body)
 
 
 @pytest.mark.skipif(not HAS_TF2, reason='tf2_ros is not installed (it has no wheel)')

@@ -154,6 +154,34 @@ def test_occupancy_is_what_a_costmap_takes(b, reduced):
         assert np.isin(at, (value, 100)).all() and (at == value).mean() > 0.9
 
 
+def test_points_in_the_crop_box_are_in_no_output(b):
+    points = street(6000)
+    for axis in 'xy':
+        points[axis][:500] *= 0.02  # of the robot itself
+    points['z'][:500] = np.linspace(-1.5, 0.5, 500)
+    box = [-1.0, 1.0, -1.0, 1.0, -1.6, 0.6]
+    message = to_message(points, stamp=(17, 23), frame='velo_link')
+    rows, outside = ros.rows_of(message), range(500, len(points))
+    assert not b.set('input.crop_box', [1.0, -1.0, *box[2:]]).successful
+    assert np.nanmin(received(b, '~/scan', message).ranges) < 1.0
+    assert b.set('input.crop_box', str([-1, *box[1:]])).successful  # as ros2 param set sends it
+    try:
+        assert b.node.config.input.crop_box == tuple(box)
+        parts = b.segment(message)
+        scan, grid, labelled = (
+            received(b, topic, message) for topic in ('~/scan', '~/occupancy', '~/labeled')
+        )
+    finally:
+        assert b.set('input.crop_box', 'none').successful
+    found = sorted(row for part in parts for row in ros.rows_of(part))
+    assert found == sorted(rows[k] for k in outside)
+    assert np.nanmin(scan.ranges) > 2.9
+    cells = np.array(grid.data, np.int8).reshape(400, 400)
+    assert not (cells[180:220, 180:220] == 100).any()
+    label = read_columns(labelled, ['label'])['label'].ravel()
+    np.testing.assert_array_equal(np.flatnonzero(label == Label.UNKNOWN), np.arange(500))
+
+
 def test_the_time_of_a_scan_is_that_between_clouds(b):
     collector = ros.Collector(b.probe, LaserScan, f'{NODE_NAME}/scan')
     publisher = next(p for o, p in b.node._outputs._publishers if o.topic == '~/scan')

@@ -24,9 +24,16 @@ from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_
 from gp_ground_seg.core.gp.learning import Learned
 from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
+from gp_ground_seg.core.parameters.schema import NO_BOX
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
 from gp_ground_seg.core.pipeline.mirror_images import MirrorImages, find_mirror_images
-from gp_ground_seg.core.pipeline.points import ENOUGH_POINTS, Direction, rotate, take_points
+from gp_ground_seg.core.pipeline.points import (
+    ENOUGH_POINTS,
+    Direction,
+    rotate,
+    take_points,
+    without_box,
+)
 from gp_ground_seg.core.pipeline.sensor_pose import (
     CLEAR_TILT,
     SensorPose,
@@ -96,6 +103,7 @@ class GroundSegmenter:
         tilt: tuple[float, float] | None = None,
         origin: tuple[float, float, float] | None = None,
         fallback: SensorPose | None = None,
+        box_frame: tuple[FloatArray, FloatArray] | None = None,
     ) -> Segmentation:
         """Label every point of a scan (paper, Algorithm 2).
 
@@ -103,7 +111,8 @@ class GroundSegmenter:
         ----------
         points : (N, >=3) float array
             x forward, y left, z up in the sensor frame [m]; never written to. A point exactly at
-            the origin of the cloud, or of the sensor, is no return: it is UNKNOWN, as NaN is.
+            the origin of the cloud, or of the sensor, or in ``input.crop_box``, is no return: it
+            is UNKNOWN, as NaN is.
         tilt : tuple of float, optional
             Roll and pitch of the sensor in this scan [rad], instead of ``sensor.roll``
             and ``sensor.pitch``.
@@ -113,6 +122,9 @@ class GroundSegmenter:
         fallback : SensorPose, optional
             Pose of the sensor in an earlier scan: where ``sensor.height`` is auto and this scan
             does not show the ground well, its height, and its angles where they are auto.
+        box_frame : tuple of float arrays, optional
+            Rotation (3, 3) and translation (3,) [m] from the frame of this scan into that of
+            ``input.crop_box``; by default they are one.
 
         Raises
         ------
@@ -132,8 +144,11 @@ class GroundSegmenter:
                 sensor = dataclasses.replace(sensor, origin_x=x, origin_y=y, origin_z=z)
             if not (fallback is None or isinstance(fallback, SensorPose)):
                 raise ConfigError(f'fallback = {_shortened(fallback)}: must be a SensorPose')
-            place = sensor.origin_x, sensor.origin_y, sensor.origin_z
-            result = self._segment(take_points(points, place), sensor, timer, fallback)
+            xyz = take_points(points, (sensor.origin_x, sensor.origin_y, sensor.origin_z))
+            box = self._config.input.crop_box
+            if box != NO_BOX:
+                xyz = without_box(xyz, box, box_frame)
+            result = self._segment(xyz, sensor, timer, fallback)
             self._warn(result.warnings)
             return result
 

@@ -27,7 +27,7 @@ from gp_ground_seg.core.errors import ConfigError, DataError, GroundSegError, re
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.log import LOGGER, in_thousands
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec, ParameterValue
+from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.colours import COLOURS, HEIGHTS, ramp_colours
@@ -239,7 +239,7 @@ def tunable() -> list[ParameterSpec]:
     return [spec for spec in parameter_specs() if spec.name.split('.')[0] not in _NO_LABELS]
 
 
-def slider_range(spec: ParameterSpec, now: ParameterValue) -> tuple[Any, Any, Any]:
+def slider_range(spec: ParameterSpec, now: Any) -> tuple[Any, Any, Any]:
     """Return least value, greatest value and step of the slider of a parameter.
 
     The values are those that people use, not all that are accepted: a fifth to five times the

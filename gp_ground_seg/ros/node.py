@@ -113,7 +113,9 @@ class GroundSegmentationNode(ConfiguredNode):
             points = read_xyz(cloud, is_single=True)
             frames = self._tf.look_up(header) if self._tf else CloudFrames()
             fallback = self._kept.fallback(header.frame_id)
-            result = self._segmenter.segment(points, frames.tilt, frames.origin, fallback)
+            result = self._segmenter.segment(
+                points, frames.tilt, frames.origin, fallback, frames.base
+            )
             if self._kept.note(result.pose):
                 text = f'on {self._input.topic}, {kept_height(result.pose)}'
                 self.get_logger().warning(text, **THROTTLED)

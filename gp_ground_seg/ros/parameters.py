@@ -33,8 +33,8 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     result = ParameterDescriptor(
         description=' '.join([spec.description, *notes]),
         additional_constraints=f'must be {spec.accepted}',
-        # ROS has no type for a number or a word; `changed` checks the value.
-        dynamic_typing=spec.auto,
+        # ROS has no type for a number or a word, or a list or a word; `changed` checks the value.
+        dynamic_typing=spec.auto or spec.type is tuple,
     )
     # No step: rclpy would refuse every value off the grid.
     low, high = spec.minimum, spec.maximum

@@ -64,10 +64,13 @@ def rotation_of(rotation: Quaternion) -> FloatArray:
     return matrix
 
 
-def tilt_of(rotation: Quaternion) -> tuple[float, float]:
-    """Return roll and pitch [rad] of a sensor frame that `rotation` turns into a level one."""
-    # The level frame's z axis in the sensor frame.
-    return angles_of(rotation_of(rotation)[2])
+def _placement(transform: Any, way: str) -> Placement:
+    """Return a geometry_msgs/Transform; raise a PointCloudError if it is none."""
+    move = transform.translation
+    translation = np.array([move.x, move.y, move.z])
+    if not np.isfinite(translation).all():
+        raise PointCloudError(f'transform {way}: its translation is {translation}')
+    return Placement(rotation_of(transform.rotation), translation)
 
 
 def is_tf_used(config: Config) -> bool:
@@ -81,6 +84,7 @@ class CloudFrames(NamedTuple):
 
     tilt: tuple[float, float] | None = None  # roll and pitch of the sensor [rad]
     origin: tuple[float, float, float] | None = None  # place of the sensor in it [m]
+    base: Placement | None = None  # where ``frame.base`` is
     output: Placement | None = (
         None  # where ``output.frame`` is; None also if it is that of the cloud
     )
@@ -141,17 +145,19 @@ class TfListener:
         Tilt and place of the sensor are those of the stamp, or the newest if TF does not reach it.
         Raises a PointCloudError if TF does not have what is asked for.
         """
-        tilt, origin, frame_id, frame = None, None, header.frame_id, self.config.frame
+        tilt, origin, base = None, None, None
+        frame_id, frame = header.frame_id, self.config.frame
         if frame.level == 'tf':
             way = f'from its frame {frame_id!r} to frame.base = {frame.base!r}'
-            tilt = tilt_of(self._newest(frame.base, frame_id, header, way).rotation)
+            base = _placement(self._newest(frame.base, frame_id, header, way), way)
+            tilt = angles_of(base.rotation[2])
         if frame.sensor != NO_FRAME:
             way = f'from frame.sensor = {frame.sensor!r} to its frame {frame_id!r}'
             place = self._newest(frame_id, frame.sensor, header, way).translation
             origin = place.x, place.y, place.z
             if not np.isfinite(origin).all():
                 raise PointCloudError(f'transform {way}: its translation is {origin}')
-        return CloudFrames(tilt, origin, self._output(header))
+        return CloudFrames(tilt, origin, base, self._output(header))
 
     def _output(self, header: Header) -> Placement | None:
         frame = self.config.output.frame
@@ -164,11 +170,7 @@ class TfListener:
             raise PointCloudError(
                 f'no transform {way} at its stamp within {MAX_WAIT:g} s: {error}'
             ) from error
-        move = found.translation
-        translation = np.array([move.x, move.y, move.z])
-        if not np.isfinite(translation).all():
-            raise PointCloudError(f'transform {way}: its translation is {translation}')
-        return Placement(rotation_of(found.rotation), translation)
+        return _placement(found, way)
 
     def _exact(self, target: str, source: str, header: Header) -> Any:
         stamp = Time.from_msg(header.stamp)

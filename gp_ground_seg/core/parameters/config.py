@@ -16,6 +16,7 @@ from typing import Any, Literal
 from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.parameters.schema import (
     AUTO,
+    NO_BOX,
     YAML_SUFFIXES,
     ParameterGroups,
     ParameterSpec,
@@ -68,10 +69,14 @@ class FrameConfig:
 
 @dataclass(frozen=True)
 class InputConfig:
-    """Clouds that are taken; the node only."""
+    """What is taken of the input."""
 
+    crop_box: tuple[float, ...] | Literal['none'] = basic(NO_BOX, (-100.0, 100.0),
+        "box about the robot's own body, whose points are no returns: x min, x max, y min, y max, "
+        'z min, z max in the frame of the cloud, or of frame.base with frame.level = tf', 'm')
     lazy: bool = advanced(False, (),
-        'subscribe to clouds only while an output has a subscriber; looked at every second')
+        'the node subscribes to clouds only while an output has a subscriber; looked at every '
+        'second')
 
 
 @dataclass(frozen=True)

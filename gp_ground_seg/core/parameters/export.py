@@ -12,6 +12,7 @@ from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.schema import (
     AUTO,
+    NO_BOX,
     ROS_NODE_KEY,
     ROS_PARAMETERS_KEY,
     ParameterSpec,
@@ -64,6 +65,8 @@ def _comment(text: str, depth: int) -> list[str]:
 
 def yaml_scalar(value: ParameterValue) -> str:
     """Write a value the way it is written in a parameter file, quoted where needed."""
+    if isinstance(value, tuple):
+        return f'[{", ".join(map(yaml_scalar, value))}]'
     text: str = yaml.safe_dump({'x': value}).strip().removeprefix('x: ')
     # PyYAML writes a frame named 1e5 without quotes: a number, for us as for ROS.
     return text if load_yaml(text) == value else f"'{value}'"
@@ -77,6 +80,8 @@ def accepted_values(spec: ParameterSpec) -> str:
         return 'true or false'
     if spec.type is str:
         return 'a name'
+    if spec.type is tuple:
+        return f'{NO_BOX} or six numbers, {spec.minimum:.10g} to {spec.maximum:.10g}'
     auto = f'{AUTO} or ' if spec.auto else ''
     return f'{auto}{spec.minimum:.10g} to {spec.maximum:.10g}'
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import functools
@@ -22,10 +23,12 @@ from gp_ground_seg.core.parameters.removed import removal
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-ParameterValue = bool | int | float | str
+ParameterValue = bool | int | float | str | tuple[float, ...]
 
 AUTO: Literal['auto'] = 'auto'
 """Value instead of a number that is estimated from the scan, where the declaration allows it."""
+NO_BOX: Literal['none'] = 'none'
+"""Value instead of the six bounds of a box: ROS does not read an empty list."""
 ROS_NODE_KEY = '/**'
 NODE_NAME = 'ground_segmentation_node'
 ROS_PARAMETERS_KEY = 'ros__parameters'
@@ -45,12 +48,14 @@ class ParameterSpec:
     """Declaration of one parameter."""
 
     name: str  # dotted, ``group.field``
-    type: type  # bool, int, float or str; that of the number where it may be `AUTO`
-    default: ParameterValue
+    type: (
+        type  # bool, int, float or str; tuple of a box; that of the number where it may be `AUTO`
+    )
+    default: Any  # a `ParameterValue`
     description: str
     unit: str  # SI; empty for a pure number
     symbol: str  # in the paper; empty if it has none
-    minimum: float | None  # inclusive, of a number; None for other types
+    minimum: float | None  # inclusive, of a number and of those of a box; None for other types
     maximum: float | None
     choices: tuple[str, ...]  # accepted strings; empty for other types, and for any name
     auto: bool  # whether a number may also be `AUTO`
@@ -66,6 +71,11 @@ class ParameterSpec:
         if self.type is str:
             return 'a name'
         unit = f' {self.unit}' if self.unit else ''
+        if self.type is tuple:
+            return (
+                f'{NO_BOX} or six numbers in [{self.minimum:g}, {self.maximum:g}]{unit}, of which '
+                'the first, third and fifth are below those that follow them'
+            )
         kind = 'an integer' if self.type is int else 'a number'
         auto = f'{AUTO} or ' if self.auto else ''
         return f'{auto}{kind} in [{self.minimum:g}, {self.maximum:g}]{unit}'
@@ -82,6 +92,9 @@ class ParameterSpec:
             known = self.choices or re.findall(r'\A[\w\-./]+\Z', str(value), re.ASCII)
             if isinstance(value, str) and value in known:
                 return value
+        elif self.type is tuple:
+            if (box := self._box(value)) is not None:
+                return box
         elif isinstance(value, numbers.Real) and not isinstance(value, bool):
             assert self.minimum is not None and self.maximum is not None
             # The bounds are finite: NaN and the infinities are never within.
@@ -94,6 +107,25 @@ class ParameterSpec:
             raise ConfigError(line)
         given = repr(value) if len(repr(value)) <= 100 else f'{repr(value)[:100]} ...'
         raise ConfigError(f'{self.name} = {given}: must be {self.accepted}')
+
+    def _box(self, value: object) -> ParameterValue | None:
+        """Return the six bounds, or `NO_BOX`, that `value` stands for; None if for neither."""
+        if isinstance(value, str):
+            # ``ros2 param set`` sends a list as text if only some of its numbers have a point.
+            with contextlib.suppress(ConfigError):
+                value = load_yaml(value)
+        if isinstance(value, str):
+            return NO_BOX if value == NO_BOX else None
+        bounds: list[Any] = list(value) if isinstance(value, Iterable) else [value]
+        if not bounds:
+            return NO_BOX
+        are_numbers = all(isinstance(b, numbers.Real) and not isinstance(b, bool) for b in bounds)
+        if len(bounds) != 6 or not are_numbers:
+            return None
+        assert self.minimum is not None and self.maximum is not None
+        pairs = zip(bounds[::2], bounds[1::2], strict=True)
+        is_box = all(self.minimum <= low < high <= self.maximum for low, high in pairs)
+        return tuple(map(float, bounds)) if is_box else None
 
 
 def declare(
@@ -108,12 +140,14 @@ def declare(
     """Declare a parameter as a field of a frozen dataclass; see `ParameterSpec`.
 
     `accepted` holds the lowest and highest number, or the accepted strings; it is empty for a bool
-    or any name. A number whose `default` is `AUTO` may be that too.
+    or any name. A number whose `default` is `AUTO` may be that too; the lowest and highest number
+    of a `default` of `NO_BOX` are those of the bounds of a box.
     """
     choices = accepted if accepted and isinstance(accepted[0], str) else ()
     auto = default == AUTO and not choices
-    kind = float if auto else type(default)
-    low, high = accepted if kind in (int, float) else (None, None)
+    is_box = default == NO_BOX and bool(accepted) and not choices
+    kind = tuple if is_box else float if auto else type(default)
+    low, high = accepted if kind in (int, float, tuple) else (None, None)
     spec = ParameterSpec(
         '', kind, default, description, unit, symbol, low, high, choices, auto, basic
     )
@@ -163,11 +197,10 @@ class ParameterGroups:
             group = dataclasses.replace(getattr(self, group_name), **values)
             object.__setattr__(self, group_name, group)
 
-    def __getitem__(self, name: str) -> ParameterValue:
-        """Value of the parameter with the dotted `name`."""
+    def __getitem__(self, name: str) -> Any:
+        """Value of the parameter with the dotted `name`, in its declared type."""
         group_name, field_name = self.find_spec(name).name.split('.')
-        value: ParameterValue = getattr(getattr(self, group_name), field_name)
-        return value
+        return getattr(getattr(self, group_name), field_name)
 
     def flat(self) -> dict[str, ParameterValue]:
         """Every value by its dotted name, in order of declaration."""

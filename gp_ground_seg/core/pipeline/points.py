@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -111,6 +112,30 @@ def _shared_places(x: PointArray, xyz: PointArray) -> list[Place]:
     rows, number = np.unique(xyz[sample], axis=0, return_counts=True)
     places = [(a, b, c) for a, b, c in rows[number >= _N_ALIKE].tolist()]
     return [place for place in places if math.hypot(*place) <= _FARTHEST_MOUNT]
+
+
+@np.errstate(invalid='ignore', over='ignore')
+def without_box(
+    xyz: PointArray, box: Sequence[float], frame: tuple[FloatArray, FloatArray] | None
+) -> PointArray:
+    """Return points (N, 3) with NaN in place of those in a box, or `xyz` if none is in it.
+
+    The `box` ends at the least and the greatest x, y and z [m], and has these. `frame` is the
+    rotation (3, 3) and translation (3,) [m] into the frame of the box; None if it is that of the
+    points.
+    """
+    columns: PointArray = xyz.T
+    if frame is not None:
+        turn, move = frame
+        columns = rotate(xyz, turn).T + move[:, None]
+    inside = np.ones(len(xyz), dtype=np.bool_)
+    for values, low, high in zip(columns, box[::2], box[1::2], strict=True):
+        inside &= (values >= low) & (values <= high)
+    if not inside.any():
+        return xyz
+    xyz = np.array(xyz, order='F')
+    xyz[inside] = np.nan
+    return xyz
 
 
 @np.errstate(all='ignore')
