@@ -19,7 +19,7 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.time import Time
 from ros_helpers import bench, street, to_message, wait_for, xyz_of
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import LaserScan, PointCloud2
+from sensor_msgs.msg import Imu, LaserScan, PointCloud2
 from test_sensor_pose import ROOM
 
 from gp_ground_seg import Config, GroundSegmenter, Label
@@ -223,7 +223,7 @@ def test_outputs_in_a_frame_of_tf_at_the_stamp(monkeypatch):
         messages = [to_message(points, stamp=(3, n), frame='tilted_lidar') for n in range(2)]
         for message in messages:
             b.publisher.publish(message)
-        wait_for(lambda: b.node._tf and len(b.node._tf._waiting) == 2, 'clouds that wait')
+        wait_for(lambda: b.node._frames and len(b.node._frames._waiting) == 2, 'clouds that wait')
         assert not b.ground.messages
         StandInBuffer.known = dict.fromkeys(frames, quaternion(turn))
         StandInBuffer.newest = 100
@@ -234,7 +234,7 @@ def test_outputs_in_a_frame_of_tf_at_the_stamp(monkeypatch):
         monkeypatch.setattr(transforms, 'MAX_WAIT', 0.05)
         b.publisher.publish(to_message(points, stamp=(200, 0), frame='tilted_lidar'))
         b.wait_for_status('input', lambda v, s: "output.frame = 'odom' at its stamp" in s.message)
-        assert len(b.ground.messages) == 2 and not b.node._tf._waiting
+        assert len(b.ground.messages) == 2 and not b.node._frames._waiting
         # In the frame of the cloud there is nothing to turn.
         same = to_message(points, stamp=(5, 0), frame='odom')
         assert b.set('frame.level', 'sensor').successful
@@ -306,6 +306,67 @@ def test_the_crop_box_is_in_the_base_of_tf(monkeypatch):
     assert found == sorted(row for row, is_body in zip(rows, inside, strict=True) if not is_body)
 
 
+def imu_message(matrix, stamp, frame='tilted_lidar', has_orientation=True):
+    message = Imu(orientation=quaternion(matrix))
+    message.header.stamp.sec, message.header.stamp.nanosec = stamp
+    message.header.frame_id = frame
+    message.orientation_covariance[0] = 0.01 if has_orientation else -1.0
+    return message
+
+
+BY_IMU = {**VALUES, 'frame.level': 'imu', 'diagnostics.period': 0.1}
+
+
+def test_tilt_by_an_imu(monkeypatch):
+    points, turn = turned_street(yaw=1.0)
+
+    def cloud(seconds):
+        return to_message(points, stamp=(seconds, 10_000_000), frame='tilted_lidar')
+
+    with bench(*ros.given(BY_IMU)) as b:
+        imu = b.probe.create_publisher(Imu, 'imu', 10)
+        wait_for(lambda: imu.get_subscription_count() == 1, 'subscription of imu')
+
+        def refused(seconds, reason):
+            b.publisher.publish(cloud(seconds))
+            return b.wait_for_status('input', lambda _, s: reason in s.message)
+
+        refused(2, f'no message on {ros.NAMESPACE}/imu, for frame.level = imu')
+        # A cloud waits for the first orientation that is newer; the nearest in time holds.
+        monkeypatch.setattr(transforms, 'MAX_WAIT', 60.0)
+        b.publisher.publish(cloud(3))
+        wait_for(lambda: len(b.node._frames._waiting) == 1, 'cloud that waits')
+        for nanosec, matrix in ((0, np.eye(3)), (9_000_000, turn), (12_000_000, np.eye(3))):
+            imu.publish(imu_message(matrix, (3, nanosec)))
+        check_levelled(points, cloud(3), (b.ground.wait(1)[0], b.obstacles.wait(1)[0]))
+        # Refused: far from it in time, without an orientation, in a frame that is not known.
+        monkeypatch.setattr(transforms, 'MAX_WAIT', 0.1)
+        refused(4, 'is 0.998 s from its stamp: must be within 0.05 s')
+        imu.publish(imu_message(turn, (5, 10_000_000), has_orientation=False))
+        refused(5, 'orientation_covariance[0] is -1')
+        imu.publish(imu_message(turn, (6, 10_000_000), frame='imu_link'))
+        refused(6, 'to that of /test_' if HAS_TF2 else 'needs tf2_ros (sudo apt install')
+        assert len(b.ground.messages) == 1
+        assert b.set('frame.level', 'sensor').successful
+        wait_for(lambda: imu.get_subscription_count() == 0, 'end of the subscription of imu')
+        assert len(b.segment(cloud(7))) == 2
+
+
+@pytest.mark.usefixtures('stand_in')
+def test_tilt_by_an_imu_in_another_frame(monkeypatch):
+    points, turn = turned_street(yaw=1.0)
+    mount = rotation(-1.2, 0.7)
+    known = {('imu_link', 'tilted_lidar'): quaternion(mount)}
+    monkeypatch.setattr(StandInBuffer, 'known', known)
+    message = to_message(points, stamp=(3, 4), frame='tilted_lidar')
+    with bench(*ros.given(BY_IMU)) as b:
+        imu = b.probe.create_publisher(Imu, 'imu', ros.BEST_EFFORT)
+        wait_for(lambda: imu.get_subscription_count() == 1, 'subscription of imu')
+        imu.publish(imu_message(turn @ mount.T, (3, 5), 'imu_link'))
+        wait_for(lambda: b.node._frames._imu._messages, 'orientation')
+        check_levelled(points, message, b.segment(message))
+
+
 @pytest.mark.skipif(not HAS_TF2, reason='tf2_ros is not installed (it has no wheel)')
 def test_tilt_by_real_tf():
     from tf2_ros import StaticTransformBroadcaster
@@ -319,6 +380,6 @@ def test_tilt_by_real_tf():
         known.transform.rotation = quaternion(turn)
         broadcaster.sendTransform(known)
         wait_for(
-            lambda: b.node._tf._buffer.can_transform('base_link', 'tilted_lidar', Time()), 'TF'
+            lambda: b.node._frames._buffer.can_transform('base_link', 'tilted_lidar', Time()), 'TF'
         )
         check_levelled(points, message, b.segment(message))

@@ -69,7 +69,7 @@ def test_every_parameter_is_described_with_type_range_unit_and_symbol(b):
         assert descriptor.name == spec.name
         assert descriptor.type == TYPES[type(spec.default)]
         assert not descriptor.read_only
-        assert descriptor.dynamic_typing == spec.auto
+        assert descriptor.dynamic_typing == (spec.auto or spec.type is tuple)
         assert spec.description in descriptor.description
         assert spec.unit in descriptor.description
         assert spec.symbol in descriptor.description

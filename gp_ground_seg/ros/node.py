@@ -35,8 +35,9 @@ from gp_ground_seg.ros.parameters import ConfiguredNode, describe
 from gp_ground_seg.ros.start_stop import child_command
 from gp_ground_seg.ros.transforms import (
     CloudFrames,
+    FrameListener,
     KeptPose,
-    TfListener,
+    is_listening,
     is_tf_used,
     require_tf2,
 )
@@ -69,7 +70,7 @@ class GroundSegmentationNode(ConfiguredNode):
         super().__init__(NODE_NAME, **options)
         self._library_log = ExitStack()
         self._library_log.enter_context(log.passed_to(self._pass_on))
-        self._tf: TfListener | None = None
+        self._frames: FrameListener | None = None
         # A guard condition runs in the executor, between two callbacks.
         self._loaded = self.create_guard_condition(self._change_backend)
         self._make_segmenter()
@@ -93,7 +94,7 @@ class GroundSegmentationNode(ConfiguredNode):
             self._input = CloudSubscription(
                 self, 'points', self._on_cloud, self._why_idle, self._on_time_jump
             )
-        self._follow_tf(self.config)
+        self._follow_frames(self.config)
         self._diagnostics = Diagnostics(self, self._state, self.config.diagnostics)
         self.warn_of_unused_parameters()
         self._load_backend(self.config)
@@ -105,13 +106,13 @@ class GroundSegmentationNode(ConfiguredNode):
         It came at the time `arrival` of ``time.monotonic`` [s], and `n_lost` before it did not.
         """
         if self._input.idle:
-            return  # it has waited for TF, and is not wanted any more
+            return  # it has waited for TF or IMU, and is not wanted any more
         start, header = time.monotonic(), cloud.header
         self._diagnostics.arrived(cloud, arrival, n_lost)
         try:
             # Code for the other precision would have to be compiled at the first start too.
             points = read_xyz(cloud, is_single=True)
-            frames = self._tf.look_up(header) if self._tf else CloudFrames()
+            frames = self._frames.look_up(header) if self._frames else CloudFrames()
             fallback = self._kept.fallback(header.frame_id)
             result = self._segmenter.segment(
                 points, frames.tilt, frames.origin, fallback, frames.base
@@ -160,7 +161,7 @@ class GroundSegmentationNode(ConfiguredNode):
         runtime = config.runtime if self._is_compiled else self._segmenter.config.runtime
         self._segmenter.configure(dataclasses.replace(config, runtime=runtime))
         self._kept.forget()
-        self._follow_tf(config)
+        self._follow_frames(config)
         self._diagnostics.configure(config.diagnostics)
 
     def _pass_on(self, level: int, message: str) -> None:
@@ -190,15 +191,16 @@ class GroundSegmentationNode(ConfiguredNode):
         # Where `runtime` has changed meanwhile, this makes another backend.
         self._segmenter.configure(self.config)
 
-    def _follow_tf(self, config: Config) -> None:
-        """Listen to TF while the parameters ask for it; clouds wait for it then."""
-        if is_tf_used(config):
-            self._tf = self._tf or TfListener(self, config, self._on_cloud)
-            self._tf.config = config
-        elif self._tf is not None:
-            self._tf.close()
-            self._tf = None
-        self._input.callback = self._tf.hold if self._tf else self._on_cloud
+    def _follow_frames(self, config: Config) -> None:
+        """Listen to TF and IMU while the parameters ask for it; clouds wait for them then."""
+        before = self._frames.config if self._frames else Config()
+        is_same = (config.frame, config.output.frame) == (before.frame, before.output.frame)
+        if self._frames is not None and not is_same:
+            self._frames.close()
+            self._frames = None
+        if self._frames is None and is_listening(config):
+            self._frames = FrameListener(self, config, self._on_cloud)
+        self._input.callback = self._frames.hold if self._frames else self._on_cloud
 
     @property
     def is_compiling(self) -> bool:
@@ -215,8 +217,8 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def _on_time_jump(self, seconds: float) -> None:
         self._kept.forget()
-        if self._tf is not None:
-            self._tf.time_jumped(seconds)
+        if self._frames is not None:
+            self._frames.time_jumped(seconds)
         self._diagnostics.input.time_jumped()
 
     def _state(self) -> tuple[InputFacts, dict[str, int]]:

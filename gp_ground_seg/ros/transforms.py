@@ -1,4 +1,4 @@
-"""Where the sensor and the outputs are: by TF at the stamp of each cloud, or by earlier clouds."""
+"""Where the sensor and the outputs are: by TF or an IMU at the stamp of a cloud, or by earlier."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from geometry_msgs.msg import Quaternion
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import Imu, PointCloud2
 from std_msgs.msg import Header
 
 from gp_ground_seg.core.errors import MissingDependencyError, PointCloudError
@@ -22,11 +23,22 @@ from gp_ground_seg.core.parameters.config import NO_FRAME, Config
 from gp_ground_seg.core.pipeline.points import angles_of
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.data.costmap import Placement
-from gp_ground_seg.ros.input import STEADY_CLOCK, OnCloud
+from gp_ground_seg.ros.input import STEADY_CLOCK, OnCloud, seconds_of
 
 KEPT_JUMP = 1.0  # jump back up to which transforms are kept: a late stamp, no other run [s]
 MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]
 REVIEW_PERIOD = 0.005  # time between two looks at whether they have come [s]
+IMU_TOLERANCE = 0.05  # time between a cloud and the orientation that holds for it, at most [s]
+IMU_DEPTH = 400  # messages kept: those of the wait and of a cloud before, at 1 kHz
+INSTALL_TF2 = 'sudo apt install ros-jazzy-tf2-ros-py'
+
+
+def find_tf2() -> Any:
+    """Return the module tf2_ros, None if it is not installed."""
+    try:
+        return importlib.import_module('tf2_ros')
+    except ImportError:
+        return None
 
 
 def require_tf2(config: Config) -> Any:
@@ -37,13 +49,11 @@ def require_tf2(config: Config) -> Any:
         instead = 'frame.sensor = none with sensor.origin_x, origin_y and origin_z'
     elif config.frame.level != 'tf':
         asked, instead = f'output.frame = {config.output.frame}', 'output.frame = none'
-    try:
-        return importlib.import_module('tf2_ros')
-    except ImportError as error:
+    if (found := find_tf2()) is None:
         raise MissingDependencyError(
-            f'{asked}: needs tf2_ros, which cannot be imported ({error}): sudo apt '
-            f'install ros-jazzy-tf2-ros-py, or use {instead}'
-        ) from error
+            f'{asked}: needs tf2_ros, which cannot be imported: {INSTALL_TF2}, or use {instead}'
+        )
+    return found
 
 
 def rotation_of(rotation: Quaternion) -> FloatArray:
@@ -79,6 +89,11 @@ def is_tf_used(config: Config) -> bool:
     return frame.level == 'tf' or {frame.sensor, config.output.frame} != {NO_FRAME}
 
 
+def is_listening(config: Config) -> bool:
+    """Return whether a cloud needs a `FrameListener`."""
+    return config.frame.level == 'imu' or is_tf_used(config)
+
+
 class CloudFrames(NamedTuple):
     """What is known of the frame of a cloud; None for what nobody has asked for."""
 
@@ -90,28 +105,75 @@ class CloudFrames(NamedTuple):
     )
 
 
-class TfListener:
-    """Listens to TF in the executor of `node`, for what `config` asks.
+class ImuListener:
+    """Listens to ``imu`` in the executor of `node`."""
 
-    Clouds come to `hold`, which passes each on to `use`, in their order, as soon as all transforms
-    of its stamp are known, or after `MAX_WAIT`. TF comes to the same executor: a callback cannot
-    wait for it.
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._messages: deque[Imu] = deque(maxlen=IMU_DEPTH)
+        # Best effort, which takes from any publisher.
+        profile = QoSProfile(depth=IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self._subscription = node.create_subscription(Imu, 'imu', self._take, profile)
+        self.topic: str = self._subscription.topic_name
+
+    def _take(self, message: Imu) -> None:
+        self._messages.append(message)
+
+    def frame_at(self, header: Header) -> str | None:
+        """Return the frame of the IMU; None if it has sent nothing as new as a cloud."""
+        newest = self._messages[-1].header if self._messages else None
+        if newest is None or seconds_of(newest.stamp) < seconds_of(header.stamp):
+            return None
+        return str(newest.frame_id)
+
+    def at(self, header: Header) -> Imu:
+        """Return the message nearest in time to a cloud; raise a PointCloudError without one."""
+        stamp = seconds_of(header.stamp)
+        off = [abs(seconds_of(message.header.stamp) - stamp) for message in self._messages]
+        if not off:
+            raise PointCloudError(f'no message on {self.topic}, for frame.level = imu')
+        if min(off) > IMU_TOLERANCE:
+            raise PointCloudError(
+                f'the nearest orientation on {self.topic} is {min(off):.3g} s from its stamp: '
+                f'must be within {IMU_TOLERANCE:g} s'
+            )
+        found = self._messages[off.index(min(off))]
+        if found.orientation_covariance[0] == -1.0:
+            raise PointCloudError(
+                f'{self.topic} has no orientation (orientation_covariance[0] is -1): remap imu to '
+                'the output of a filter, such as imu_filter_madgwick'
+            )
+        return found
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._node.destroy_subscription(self._subscription)
+
+
+class FrameListener:
+    """Listens to TF and to an IMU in the executor of `node`, for what `config` asks.
+
+    Clouds come to `hold`, which passes each on to `use`, in their order, as soon as all that it
+    needs is known at its stamp, or after `MAX_WAIT`. TF and IMU come to the same executor: a
+    callback cannot wait for them.
     """
 
     def __init__(self, node: Node, config: Config, use: OnCloud) -> None:
         self.config = config
-        self._tf2_ros = require_tf2(config)
-        # Without the node: given one, the buffer clears itself at jumps of the node's clock,
-        # and in some releases raises an error there that ends the executor. See `time_jumped`.
-        self._buffer = self._tf2_ros.Buffer()
-        self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
+        self._imu = ImuListener(node) if config.frame.level == 'imu' else None
+        self._tf2_ros = require_tf2(config) if is_tf_used(config) else find_tf2()
+        if self._tf2_ros is not None:
+            # Without the node: given one, the buffer clears itself at jumps of the node's clock,
+            # and in some releases raises an error there that ends the executor. See `time_jumped`.
+            self._buffer = self._tf2_ros.Buffer()
+            self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
         self._waiting: deque[tuple[float, Header, Callable[[], None]]] = deque()
         self._node, self._use = node, use
         self._timer = node.create_timer(REVIEW_PERIOD, self._review, clock=STEADY_CLOCK)
         self._timer.cancel()
 
     def hold(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
-        """Keep a cloud until its transforms are known."""
+        """Keep a cloud until all that it needs is known."""
         use = partial(self._use, cloud, arrival, n_lost)
         self._waiting.append((time.monotonic() + MAX_WAIT, cloud.header, use))
         self._review()
@@ -130,6 +192,13 @@ class TfListener:
         wanted = {self.config.frame.sensor, self.config.output.frame}
         if self.config.frame.level == 'tf':
             wanted.add(self.config.frame.base)
+        if self._imu is not None:
+            frame = self._imu.frame_at(header)
+            if frame is None:
+                return False
+            wanted.add(frame)
+        if self._tf2_ros is None:
+            return True
         try:
             for frame in wanted - {NO_FRAME, header.frame_id}:
                 self._exact(frame, header.frame_id, header)
@@ -151,6 +220,8 @@ class TfListener:
             way = f'from its frame {frame_id!r} to frame.base = {frame.base!r}'
             base = _placement(self._newest(frame.base, frame_id, header, way), way)
             tilt = angles_of(base.rotation[2])
+        elif self._imu is not None:
+            tilt = angles_of(self._turn_by_imu(self._imu, header)[2])
         if frame.sensor != NO_FRAME:
             way = f'from frame.sensor = {frame.sensor!r} to its frame {frame_id!r}'
             place = self._newest(frame_id, frame.sensor, header, way).translation
@@ -158,6 +229,17 @@ class TfListener:
             if not np.isfinite(origin).all():
                 raise PointCloudError(f'transform {way}: its translation is {origin}')
         return CloudFrames(tilt, origin, base, self._output(header))
+
+    def _turn_by_imu(self, listener: ImuListener, header: Header) -> FloatArray:
+        """Return the rotation (3, 3) of a cloud into a level frame, by way of that of the IMU."""
+        found = listener.at(header)
+        turn, frame = rotation_of(found.orientation), found.header.frame_id
+        if frame == header.frame_id:
+            return turn
+        way = f'from its frame {header.frame_id!r} to that of {listener.topic}, {frame!r}'
+        if self._tf2_ros is None:
+            raise PointCloudError(f'transform {way}: needs tf2_ros ({INSTALL_TF2})')
+        return turn @ rotation_of(self._newest(frame, header.frame_id, header, way).rotation)
 
     def _output(self, header: Header) -> Placement | None:
         frame = self.config.output.frame
@@ -188,14 +270,17 @@ class TfListener:
 
     def time_jumped(self, seconds: float) -> None:
         """Forget all transforms after a long jump back."""
-        if seconds > KEPT_JUMP:
+        if seconds > KEPT_JUMP and self._tf2_ros is not None:
             self._buffer.clear()
 
     def close(self) -> None:
         """Stop listening; clouds that wait are dropped."""
         self._waiting.clear()
         self._node.destroy_timer(self._timer)
-        self._listener.unregister()
+        if self._tf2_ros is not None:
+            self._listener.unregister()
+        if self._imu is not None:
+            self._imu.close()
 
 
 class KeptPose:

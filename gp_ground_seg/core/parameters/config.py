@@ -59,8 +59,9 @@ class SensorConfig:
 class FrameConfig:
     """Source of the tilt and the position of the sensor; the node only."""
 
-    level: str = basic('sensor', ('sensor', 'tf'),
-        'source of the tilt: sensor = sensor.roll and sensor.pitch, tf = TF')
+    level: str = basic('sensor', ('sensor', 'tf', 'imu'),
+        'source of the tilt: sensor = sensor.roll and sensor.pitch, tf = TF, '
+        'imu = the orientation on topic imu')
     base: str = basic('base_link', (), 'frame that is level to TF, with frame.level = tf')
     sensor: str = advanced(NO_FRAME, (),
         'frame of the sensor, to look up its position by TF; none = sensor.origin_x, origin_y '
