@@ -239,12 +239,13 @@ class NumbaBackend:
         labels.survey(
             scan, faces.is_face, pieces, relief, relief.is_level, units, result.height, sums
         )
-        roughness_.set_roughness(scan.tiles, sums, units, blocks, counts, roughness)
+        if by_roughness:
+            roughness_.set_roughness(scan.tiles, sums, units, blocks, counts, roughness)
+        else:
+            roughness.fill(0.0)  # no band is higher than the tolerance
         depth, has_obstacle = depth_of_ground(config.label), take('has_obstacle', (n_tiles,), bool)
         has_obstacle.fill(False)
-        labels.label_by_bands(
-            scan, faces, label, depth, by_roughness, roughness, has_obstacle, result
-        )
+        labels.label_by_bands(scan, faces, label, depth, roughness, has_obstacle, result)
         if by_roughness:
             votes = labels.VoteBuffers(
                 take('rows', (n_tiles + 1,), np.int32),

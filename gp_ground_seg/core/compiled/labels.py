@@ -153,28 +153,28 @@ def label_by_bands(
     faces: Faces,
     config: LabelConfig,
     depth: float,
-    by_roughness: bool,
-    roughness: FloatArray,
+    bands: FloatArray,
     has_obstacle: BoolArray,
     result: Labelled,
 ) -> None:
     """Label the points from their heights in `result`, and find tiles of obstacles.
 
     Ground reaches `depth` below the surface. `has_obstacle` (T,) becomes true where a return near
-    the surface is no ground. `roughness` (T + 1,) is that of the ground in each tile [m]; the last
-    one, for points in no tile, is NaN.
+    the surface is no ground. `roughness` (T + 1,) is that of the ground in each tile [m], and
+    becomes the height of its band; the last one, for points in no tile, is NaN.
     """
+    for occupied in scan.tiles.occupied:
+        bands[np.uintp(occupied)] = ground_band(bands[np.uintp(occupied)], config)
     z, tile, cell = scan.xyz.T[2], scan.tiles.tile, scan.grid.cell
+    is_face, is_occluded, extremes = faces.is_face, faces.has_occluded_base, scan.tiles.extremes
     height, label, margins = result.height, result.label, result.margin
     for i in range(len(cell)):
         n, h = cell[i], height[i]
-        t = np.uintp(tile[i] if n >= 0 else len(roughness) - 1)
-        band = ground_band(roughness[t], config) if by_roughness else config.ground_tolerance
-        margin = band_margin(h, band, depth)
-        if n >= 0 and faces.is_face[t]:
-            over_lowest = np.float64(z[i]) - np.float64(scan.tiles.extremes[t, 0])
-            is_occluded = faces.has_occluded_base[t]
-            margin = face_margin(margin, over_lowest, is_occluded, config.ground_tolerance)
+        t = np.uintp(tile[i] if n >= 0 else len(bands) - 1)
+        margin = band_margin(h, bands[t], depth)
+        if n >= 0 and is_face[t]:
+            over_lowest = np.float64(z[i]) - np.float64(extremes[t, 0])
+            margin = face_margin(margin, over_lowest, is_occluded[t], config.ground_tolerance)
         margins[i] = margin
         otherwise = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
         label[i] = _GROUND if margin >= 0.0 else otherwise
