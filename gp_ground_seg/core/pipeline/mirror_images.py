@@ -57,11 +57,15 @@ def find_mirror_images(scan: Scan, pose: SensorPose, sensor: SensorConfig) -> Mi
         return none
     candidates, grid, heights = scan.candidates, scan.grid, (-pose.height, up)
     near = np.flatnonzero((candidates.r >= NEAREST) & (candidates.r < WET_REACH))
-    r, z, segment = candidates.r[near], candidates.z[near], candidates.segment[near]
-    slope, is_ground = _slope(r, z, up), np.abs(z + pose.height) <= tolerance_at(r)
-    is_image = _is_image(r, z, slope, _nearer_in_segment(slope, is_ground, segment), heights)
-    # Most scans end here.
-    if np.count_nonzero(is_image) <= WET_SHARE * np.count_nonzero(is_ground):
+    r, z = candidates.r[near], candidates.z[near]
+    is_ground = np.abs(z + pose.height) <= tolerance_at(r)
+    most_if_dry = WET_SHARE * np.count_nonzero(is_ground)
+    # Most scans end here: even if all that is deep were an image, the road would be dry.
+    if np.count_nonzero(z < -pose.height - DEEP) <= most_if_dry:
+        return none
+    slope = _slope(r, z, up)
+    nearer = _nearer_in_segment(slope, is_ground, candidates.segment[near])
+    if np.count_nonzero(_is_image(r, z, slope, nearer, heights)) <= most_if_dry:
         return none
     inside = np.flatnonzero(grid.inside)
     r, z = grid.r[inside].astype(np.float64), scan.xyz[inside, 2].astype(np.float64)
