@@ -82,7 +82,7 @@ def test_every_figure_is_as_it_was_written():
 
 
 NO_FIGURES = {
-    'images/slope.png',  # a figure of README.md
+    'images/hill.png',  # a figure of README.md
     'images/tune.png',  # a screenshot, of what test_browser.py looks at
 }
 
@@ -120,14 +120,17 @@ def test_numbers_of_pictures_come_out_again(figure, tmp_path, capsys, monkeypatc
     assert f'({said}; commit ' in figure.body, f'{figure.page}: now {said}. {ANEW}'
 
 
-@pytest.mark.slow
 @compiled
-def test_numbers_of_the_drive_come_out_again(tmp_path):
-    (figure,) = (figure for figure in FIGURES if figure.command.startswith('docs/drive.py'))
+@pytest.mark.parametrize(
+    ('script', 'made'),
+    [('hill.py', 'hill.png'), pytest.param('drive.py', 'drive.gif', marks=pytest.mark.slow)],
+)
+def test_numbers_of_the_scripts_come_out_again(script, made, tmp_path):
+    (figure,) = (one for one in FIGURES if one.command == f'docs/{script} {made}')
     (tmp_path / 'docs').symlink_to(REPOSITORY / 'docs')
-    said = figures.caption(figures.run(figure.command, '', tmp_path), 'drive.gif')
+    said = figures.caption(figures.run(figure.command, '', tmp_path), made)
     assert f'({said}; commit ' in figure.body, f'now {said}. {ANEW}'
-    assert (tmp_path / 'drive.gif').stat().st_size < 3_000_000
+    assert (tmp_path / made).stat().st_size < 3_000_000
 
 
 @pytest.mark.slow

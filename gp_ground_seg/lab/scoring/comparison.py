@@ -126,10 +126,10 @@ def interval_text(
 
 def interval_note(scores: Scores) -> str:
     """Say what the intervals of differences are, for the title of a table."""
-    n = clusters(scores)['cluster'].nunique()
-    if n < 2:
+    names = {*clusters(scores)['cluster']}
+    if (n := len(names)) < 2:
         return 'no intervals: they need two sequences, or ten frames of one'
-    kind = 'sequences' if n == len(scores.sequences) else 'scenes'
+    kind = 'sequences' if names == {*scores.sequences} else 'scenes'
     if scores.scans['cluster'].nunique() == 1:
         kind = 'blocks of successive frames'
     return f'95 % interval: bootstrap over {n} {kind}; tie: it holds 0'

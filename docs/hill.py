@@ -1,4 +1,4 @@
-"""Draw what a costmap marks of a hill, for README: ``python docs/slope.py slope.png``."""
+"""Draw what a costmap marks of a hill, for README: ``python docs/hill.py hill.png``."""
 
 from __future__ import annotations
 
