@@ -229,7 +229,7 @@ def test_rules_between_values(lower, upper, low, high):
             Config().replace(**{lower: wrong, upper: low})
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(configs(), configs())
 def test_forms_agree_and_no_change_but_in_a_copy(config, other):
     with pytest.raises(dataclasses.FrozenInstanceError):

@@ -21,7 +21,7 @@ GENERATE = 'run: make generate'
 generate = load_script('docs/generate.py')
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(configs())
 def test_yaml_reads_back_in_the_types_that_ros_wants(tmp_path_factory, config):
     """ROS parameters are typed: 2 is not a double, and 1e-05 without a point is no number."""
@@ -41,7 +41,7 @@ def test_yaml_reads_back_in_the_types_that_ros_wants(tmp_path_factory, config):
             assert type(value) is spec.type or (spec.auto and value == 'auto')
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(configs(), st.booleans(), st.booleans())
 def test_any_yaml_writer_will_do(tmp_path_factory, config, flow, ros):
     path = tmp_path_factory.mktemp('yaml') / 'a.yaml'

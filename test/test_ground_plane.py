@@ -77,7 +77,7 @@ def slow_lowest(candidates):
     return [(cell[0], *lowest[cell]) for cell in sorted(lowest)]
 
 
-@settings(max_examples=fewer(60, 10))
+@settings(max_examples=fewer(20, 10))
 @given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.integers(0, 40), st.floats(0.0, 1.0))
 def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
     origin = tuple(np.random.default_rng(seed).choice([0.0, -1.3, 2.0], 3).tolist())
@@ -169,7 +169,7 @@ def slow_refutation(plane, cells, origin):
     return total
 
 
-@settings(max_examples=fewer(60, 10))
+@settings(max_examples=fewer(20, 10))
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 1.0), st.floats(-2.0, 3.0))
 def test_score_of_a_plane_by_loops(seed, share, lift):
     rng = np.random.default_rng(seed)

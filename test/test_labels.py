@@ -171,7 +171,7 @@ def test_the_band_follows_the_roughness_up_to_the_height_of_no_ground(backend, r
     assert list(label(backend, ranges, heights, rule='tolerance')[0].label[:3]) == [O, O, O]
 
 
-@settings(max_examples=fewer(60, 10))
+@settings(max_examples=fewer(20, 10))
 @given(st.integers(0, 10_000), st.sampled_from([np.float32, np.float64]))
 def test_labels_are_the_reference(backend, seed, dtype):
     rng = np.random.default_rng(seed)

@@ -92,7 +92,7 @@ def draw_faces(seed):
     return Faces(*(np.random.default_rng(seed).uniform(size=(2, N_TILES)) < 0.2))
 
 
-@settings(max_examples=fewer(100, 20))
+@settings(max_examples=fewer(40, 20))
 @given(
     st.integers(0, 10_000),
     st.sampled_from([1.0, 2.5, 3.0, 10.0]),

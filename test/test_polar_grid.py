@@ -40,7 +40,7 @@ def assert_same_scan(found, expected):
         np.testing.assert_allclose(column, other, rtol, err_msg=name)
 
 
-@settings(max_examples=fewer(100, 10))
+@settings(max_examples=fewer(40, 10))
 @given(PLACE, PLACE, st.integers(4, 50), st.integers(4, 50), st.floats(1.0, 2.9))
 def test_cell_of_a_point(backend, x, y, n_segments, n_bins, growth):
     config = config_of(n_segments=n_segments, n_bins=n_bins, bin_growth=growth)
@@ -78,7 +78,7 @@ def test_both_sides_of_the_negative_x_axis(backend):
 
 
 @pytest.mark.filterwarnings('ignore:overflow')
-@settings(max_examples=fewer(100, 5))
+@settings(max_examples=fewer(30, 5))
 @given(
     st.integers(0, 10_000), st.sampled_from([0, 1, 400]), st.sampled_from([np.float32, np.float64])
 )

@@ -129,7 +129,7 @@ def test_wrong_shapes_and_types_are_refused_with_the_shape():
     assert len(SEGMENTER.segment(hilly_scan(100)).label) == 100
 
 
-@settings(max_examples=fewer(25, 3))
+@settings(max_examples=fewer(8, 3))
 @given(st.integers(0, 2**32 - 1))
 def test_permuting_points_permutes_the_result(backend, seed):
     points = hilly_scan(600, seed=seed)
@@ -141,7 +141,7 @@ def test_permuting_points_permutes_the_result(backend, seed):
     np.testing.assert_array_equal(shuffled.ground_z, straight.ground_z[order])
 
 
-@settings(max_examples=fewer(25, 3))
+@settings(max_examples=fewer(8, 3))
 @given(st.integers(0, 2**32 - 1), st.floats(-1.0, 5.0))
 def test_raising_sensor_and_points_together_shifts_heights_only(backend, seed, lift):
     points = hilly_scan(600, seed=seed)
@@ -262,8 +262,9 @@ def labelled_by_the_loops(*changes):
     return segmenter_of(Reference(), **dict(changes)).segment(hilly_scan(400))
 
 
-@pytest.mark.parametrize('model', ['latent', 'line_gradient', 'constant'])
-@pytest.mark.parametrize('objective', ['map', 'paper'])
+@pytest.mark.parametrize(
+    ('model', 'objective'), [('latent', 'map'), ('line_gradient', 'paper'), ('constant', 'paper')]
+)
 def test_frames_are_labelled_as_by_the_loops(backend, model, objective):
     changes = {
         'length_scale.model': model,

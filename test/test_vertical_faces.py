@@ -118,7 +118,7 @@ def test_a_wall_seen_over_an_obstacle_is_no_ground(backend):
     assert taken[Config().faces.max_foot_distance] == 0.0
 
 
-@settings(max_examples=fewer(100, 10))
+@settings(max_examples=fewer(30, 10))
 @given(st.integers(0, 10_000), st.sampled_from([np.float32, np.float64]))
 def test_faces_are_the_reference(backend, seed, dtype):
     rng = np.random.default_rng(seed)
