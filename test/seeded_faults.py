@@ -137,8 +137,10 @@ def tests_of(coverage, fault):
     """
     room, stem = fault['file'].split('/')[1], Path(fault['file']).stem
     wanted = set(range(fault['first'], fault['line'] + 1))
+    is_compiled = re.search('/(compiled|gp|pipeline)/', fault['file'])
     tests, modules = [], []
-    for path in sorted((coverage / ('core' if room == 'core' else 'rest')).iterdir()):
+    sides = ['core', 'rest'][room != 'core' : 1 if is_compiled else 2]
+    for path in (path for side in sides for path in sorted((coverage / side).iterdir())):
         module, names, is_used = f'test/test_{path.name.partition("_")[2]}.py', set(), False
         with sqlite3.connect(path) as data:
             rows = data.execute(
@@ -148,9 +150,13 @@ def tests_of(coverage, fault):
         for context, bits in rows:
             is_used |= context != ''
             if any(line // 8 < len(bits) and bits[line // 8] >> line % 8 & 1 for line in wanted):
-                names.add(context.rpartition('.')[2] if context.startswith('test_') else '')
-        tests += [f'{module}::{name}' for name in sorted(names - {''})]
-        modules += [module] if names == {''} and is_used else []
+                named = re.fullmatch(r'test_\w+\.(test_\w+)', context)
+                names.add(named[1] if named else context)
+        own = {name for name in names if name.startswith('test_')}
+        tests += [f'{module}::{name}' for name in sorted(own)]
+        # Hypothesis stands between a test and what it draws; a fixture has no context.
+        if names - own - {''} or (names == {''} and is_used):
+            modules.append(module)
     naming = [
         f'test/{path.name}' for path in TREE.glob('test/test_*.py')
         if re.search(rf'\b{room}\b[^\n]*\b{stem}\b', path.read_text())

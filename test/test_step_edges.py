@@ -26,7 +26,7 @@ OS1_64 = dataclasses.replace(
 )
 # With fewer columns: the simulation takes most of the time of these tests.
 MOUNTED = {
-    name: dataclasses.replace(sensor, n_columns=900)
+    name: dataclasses.replace(sensor, n_columns=720)
     for name, sensor in {
         'hdl-64e': SENSORS['hdl-64e'],
         'os1-64': OS1_64,
@@ -105,8 +105,12 @@ def sees_behind(sensor, at, depth):
 DROPS = [
     (name, at, depth, heading)
     for name, sensor in MOUNTED.items()
-    for at, heading in ((4.5, 0.4), (6.0, math.pi), (9.0, -1.0))
-    for depth in (0.3, 0.6, 1.2)
+    for at, heading, depths in (
+        (4.5, 0.4, (0.3, 1.2)),
+        (6.0, math.pi, (0.6,)),
+        (9.0, -1.0, (0.3, 1.2)),
+    )
+    for depth in depths
     if sees_behind(sensor, at, depth)
 ]
 
@@ -142,10 +146,10 @@ def test_only_the_depth_that_is_seen_counts():
     assert np.isfinite(r[distance <= 10.0]).mean() >= 0.95
 
 
-@pytest.mark.parametrize('at', [2.0, 4.0, 6.0, 10.0])
+@pytest.mark.parametrize('at', [2.0, 6.0])
 @pytest.mark.parametrize('name', MOUNTED)
 def test_long_ramps_are_no_edges(name, at):
-    for degrees in (5.0, 10.0, 15.0):
+    for degrees in (5.0, 15.0):
         assert n_edges(ramp(at, -math.tan(math.radians(degrees))), MOUNTED[name]) == 0
 
 
@@ -175,8 +179,7 @@ def test_the_parameter_is_the_step(name):
     assert n_edges(drop(5.0, 0.6), MOUNTED[name], max_step_down=0.5) > 100
 
 
-@pytest.mark.parametrize('seed', [1, 2, 3])
-@pytest.mark.parametrize('name', ['hdl-64e', 'os1-128', 'vlp-16'])
+@pytest.mark.parametrize(('name', 'seed'), [('hdl-64e', 1), ('os1-128', 2), ('vlp-16', 3)])
 def test_rough_ground_is_no_edge(name, seed):
     rubble = rough(np.random.default_rng(seed), 0.1, (0.6, 5.0))
     assert n_edges(rubble, MOUNTED[name], seed) == 0
