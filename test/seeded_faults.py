@@ -152,7 +152,7 @@ def tests_of(coverage, fault):
             if any(line // 8 < len(bits) and bits[line // 8] >> line % 8 & 1 for line in wanted):
                 named = re.fullmatch(r'test_\w+\.(test_\w+)', context)
                 names.add(named[1] if named else context)
-        own = {name for name in names if name.startswith('test_')}
+        own = {name for name in names if re.fullmatch(r'test_\w+', name)}
         tests += [f'{module}::{name}' for name in sorted(own)]
         # Hypothesis stands between a test and what it draws; a fixture has no context.
         if names - own - {''} or (names == {''} and is_used):

@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.frame import GroundSurface
 from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.data import costmap
 from gp_ground_seg.data.costmap import DIRECTIONS, FREE, OCCUPIED, UNKNOWN, Placement
@@ -88,9 +89,26 @@ def test_places_beyond_the_grid_or_beyond_all_numbers_are_no_cells():
     assert np.nanmin(costmap.scan_ranges(far, far)) == np.float32(19.99)
 
 
-@pytest.mark.parametrize('scene', ['urban', 'car_park'])
-@pytest.mark.parametrize('sensor', ['hdl-64e', 'os1-128'])
-@pytest.mark.parametrize('seed', [0, 7])
+def test_the_ground_is_known_as_far_as_that_of_the_segment_of_a_direction():
+    knots, n_known = np.array([5.0, 10.0, 20.0]), np.array([0, 1, 2, 3])
+    std = np.where(np.arange(3) < n_known[:, None], 0.01, 1.0)
+    surface = GroundSurface(knots, np.zeros_like(std), std, np.ones(0, dtype=bool))
+    quarters = np.repeat([0.0, 5.0, 10.0, 20.0], DIRECTIONS // 4)
+    for quarter_turns in range(4):
+        heading = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), quarter_turns)
+        reach = costmap.reach_of_model(surface, heading, 0.1)
+        np.testing.assert_array_equal(reach, np.roll(quarters, -quarter_turns * DIRECTIONS // 4))
+
+
+@pytest.mark.parametrize(
+    ('scene', 'sensor', 'seed'),
+    [
+        ('urban', 'hdl-64e', 0),
+        ('urban', 'os1-128', 7),
+        ('car_park', 'hdl-64e', 7),
+        ('car_park', 'os1-128', 0),
+    ],
+)
 def test_nothing_that_stands_is_missing_and_ground_is_no_obstacle(scene, sensor, seed):
     """Of the simulated street, within the grid: things of 0.3 to 2 m over its exact ground."""
     scan, segmented = street(sensor, seed, scene)
