@@ -140,9 +140,10 @@ def test_segments_side_by_side(scan, tmp_path, capsys):
 
 def test_what_is_drawn_is_the_result():
     """The curves' data, read back from the axes."""
-    result = GroundSegmenter().segment(hilly_scan().astype(np.float32))
+    points = hilly_scan().astype(np.float32)
+    result = GroundSegmenter().segment(points)
     above, below = Figure().subplots(2)
-    view = SegmentView(result, SEGMENT)
+    view = SegmentView(result, SEGMENT, points[:, 2])
     view.draw_ground(above)
     view.draw_length_scale(below, 40.0, with_pseudo_inputs=True)
 

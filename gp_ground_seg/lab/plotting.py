@@ -197,23 +197,18 @@ def plot_segment(
     """
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
     check_lengths(len(z), result=result.label, truth=truth)
-    views = [SegmentView(result, segment) for segment in segments]
-    inside = [
-        (result.grid.segment == segment) & (result.grid.bin != OUTSIDE) for segment in segments
-    ]
-    points_of = [(result.grid.r[part], z[part]) for part in inside]
-    reach = max(v.reach(r) for v, (r, _) in zip(views, points_of, strict=True))
-    shown = [v.heights_shown(reach, z) for v, (_, z) in zip(views, points_of, strict=True)]
-    low, high = min(low for low, _ in shown), max(high for _, high in shown)
+    views = [SegmentView(result, segment, z) for segment in segments]
+    reach = max(view.reach() for view in views)
+    lows, highs = zip(*(view.heights_shown(reach) for view in views), strict=True)
+    low, high = min(lows), max(highs)
     figure, panels = _panels(len(views))
     scales, with_pseudo_inputs = [], config.length_scale.model == 'latent'
-    for view, (r, z), part, (above, below) in zip(views, points_of, inside, panels.T, strict=True):
-        n_hidden = np.count_nonzero((r > reach) | (z < low) | (z > high))
+    for view, (above, below) in zip(views, panels.T, strict=True):
+        n_hidden = np.count_nonzero((view.r > reach) | (view.z < low) | (view.z > high))
         name = f'{title}, {view.name}' if title else view.name
         name = f'{name}; {n_hidden} points outside'
         above.set_title(name, fontsize=12, loc='left', parse_math=False)
-        _, kinds = label_layers(result.label[part], None if truth is None else truth[part])
-        view.draw_points(above, r, z, kinds)
+        view.draw_points(above, truth)
         view.draw_ground(above)
         view.draw_length_scale(below, reach, with_pseudo_inputs=with_pseudo_inputs)
         scales.append(below.get_ylim())
@@ -254,13 +249,19 @@ def _finish(axes: Any, *, has_legend: bool, with_counts: bool) -> None:
 
 
 class SegmentView:
-    """The parts of the picture of a segment; ConfigError if there is no such segment."""
+    """The parts of the picture of a segment; ConfigError if there is no such segment.
 
-    def __init__(self, result: Segmentation, segment: int) -> None:
+    `z` (N,) are the heights of all points in the level frame [m]; `r` and `z` of the view are
+    ranges and heights of those in the segment.
+    """
+
+    def __init__(self, result: Segmentation, segment: int, z: FloatArray) -> None:
         n_segments = result.grid.n_segments
         if not 0 <= segment < n_segments:
             raise ConfigError(f'segment {segment}: must be in [0, {n_segments - 1}]')
         self._result, self._segment = result, segment
+        self._inside = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
+        self.r, self.z = result.grid.r[self._inside], z[self._inside]
         first, last = result.candidates.offsets[segment : segment + 2].tolist()
         own = result.candidates.where(result.candidates.segment == segment)
         self._r, self._z = own.r, own.z + result.relief.at(own.x, own.y)
@@ -283,16 +284,17 @@ class SegmentView:
         heights = self._result.relief.at_knots(r, self._result.grid.n_segments)
         return np.asarray(heights[self._segment])
 
-    def reach(self, point_r: FloatArray) -> float:
+    def reach(self) -> float:
         """Return the range that holds all candidates, or if none all points [m]."""
-        r = self._r if len(self._r) else point_r
+        r = self._r if len(self._r) else self.r
         return float(r.max()) + BEYOND if len(r) else float(self._result.grid.edges[-1])
 
-    def draw_points(self, axes: Any, r: FloatArray, z: FloatArray, kinds: Layers) -> None:
-        """Draw points over range by label, and errors on them."""
-        for name, chosen in kinds.items():
+    def draw_points(self, axes: Any, truth: Labels | None) -> None:
+        """Draw points over range by label, and errors on them, if the true labels are known."""
+        own = None if truth is None else truth[self._inside]
+        for name, chosen in label_layers(self._result.label[self._inside], own)[1].items():
             look = {'color': COLOURS[name], 'label': f'{name} ({np.count_nonzero(chosen)})'}
-            axes.plot(r[chosen], z[chosen], 'o', ms=3.6, mew=0, zorder=2, **look)
+            axes.plot(self.r[chosen], self.z[chosen], 'o', ms=3.6, mew=0, zorder=2, **look)
 
     def draw_ground(self, axes: Any) -> None:
         """Draw ground, lines and candidates over range."""
@@ -309,10 +311,10 @@ class SegmentView:
             axes.plot(self._r[chosen], self._z[chosen], 'o', label=label, **look)
         axes.set_ylabel('height z, sensor frame [m]')
 
-    def heights_shown(self, reach: float, point_z: FloatArray) -> tuple[float, float]:
+    def heights_shown(self, reach: float) -> tuple[float, float]:
         """Limits around the candidates near the ground, as far as it rests on inliers [m]."""
         if not (self._inlier & (self._r <= reach)).any():
-            low, high = np.quantile(point_z, (0.0, 0.5)) if len(point_z) else (-2.0, 0.0)
+            low, high = np.quantile(self.z, (0.0, 0.5)) if len(self.z) else (-2.0, 0.0)
             return float(low) - BELOW, float(high) + ABOVE
         height = np.abs(self._z - np.interp(self._r, self._knots, self._mean))
         near = self._z[(height <= NEAR_GROUND) & (self._r <= reach)]
