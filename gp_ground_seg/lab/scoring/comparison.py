@@ -60,7 +60,7 @@ class Interval(NamedTuple):
 
 def iou_measure(convention: str = '') -> Measure:
     """Return the IoU in a convention; without one, in columns that are of one only."""
-    return LABEL_MEASURES['iou'].within(f'{convention}_' if convention else '')
+    return LABEL_MEASURES['iou'].prefixed(f'{convention}_' if convention else '')
 
 
 RMSE = HEIGHT_MEASURES['rmse']
@@ -169,7 +169,7 @@ def measures(convention: str) -> dict[Column, Measure]:
     titles = {'IoU [%]': 'iou', 'precision [%]': 'precision', 'recall [%]': 'recall'}
     return {
         **{
-            percent(title): LABEL_MEASURES[name].within(f'{convention}_')
+            percent(title): LABEL_MEASURES[name].prefixed(f'{convention}_')
             for title, name in titles.items()
         },
         percent('returns on objects called ground [%]'): Measure(('n_ground',), ('n_returns',)),

@@ -107,7 +107,7 @@ class Measure(NamedTuple):
         value = ratio(*(sum(sums[name] for name in names) for names in self[:2]))
         return np.sqrt(value) if self.is_root else value
 
-    def within(self, prefix: str) -> Measure:
+    def prefixed(self, prefix: str) -> Measure:
         """Return it of columns whose names have a prefix."""
         above, below = (tuple(f'{prefix}{name}' for name in names) for names in self[:2])
         return Measure(above, below, self.is_root)
@@ -138,7 +138,7 @@ RMSE; bias, the mean error; the standardised mean squared error, mean((y - mu)^2
 
 def label_ratios(sums: Any, prefix: str = '') -> dict[str, Any]:
     """Return `LABEL_MEASURES` of sums whose names have the `prefix`, by name."""
-    return {name: measure.within(prefix).of(sums) for name, measure in LABEL_MEASURES.items()}
+    return {name: measure.prefixed(prefix).of(sums) for name, measure in LABEL_MEASURES.items()}
 
 
 def height_ratios(sums: Any) -> dict[str, Any]:
