@@ -19,7 +19,7 @@ from gp_ground_seg.lab.simulation import Scene
 from gp_ground_seg.lab.simulation import terrain as landforms
 
 
-@pytest.mark.parametrize('scene', ['flat', 'urban'])
+@pytest.mark.parametrize('scene', ['urban', 'car_park'])
 @pytest.mark.parametrize(
     ('length', 'width', 'ahead', 'below'),
     [(3.0, 3.0, 0.0, 0.3), (3.0, 2.2, -1.0, 0.5), (2.4, 1.0, 2.0, 1.0), (8.0, 2.4, -6.0, 1.5)],

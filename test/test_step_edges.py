@@ -26,7 +26,7 @@ OS1_64 = dataclasses.replace(
 )
 # With fewer columns: the simulation takes most of the time of these tests.
 MOUNTED = {
-    name: dataclasses.replace(sensor, n_columns=720)
+    name: dataclasses.replace(sensor, n_columns=900)
     for name, sensor in {
         'hdl-64e': SENSORS['hdl-64e'],
         'os1-64': OS1_64,
@@ -195,7 +195,7 @@ def test_a_drop_in_uneven_ground_is_found():
 
 @pytest.mark.parametrize('name', ['hdl-64e', 'vlp-16'])
 def test_streets_and_wet_roads_have_no_edges(name):
-    for scene in ('urban', 'car_park', 'wet_road'):
+    for scene in ('urban', 'car_park', 'traffic_jam', 'wet_road'):
         assert n_edges(SCENES[scene](1), MOUNTED[name], 1) == 0
 
 
