@@ -295,7 +295,7 @@ def test_numbers_are_read_as_ros_reads_them(from_text, number):
         ('grid: {n_bins: !!timestamp x}', 'not valid YAML'),
         ('grid: {n_bins: 2011-02-03}', 'grid.n_bins = datetime.date(2011, 2, 3): must be an int'),
         ('grid: ' + '[' * 3000, 'line 1: more than 20 levels'),
-        ('\n'.join(f'a{k}: 1' for k in range(20_000)), 'more than 500 values'),
+        ('\n'.join(f'a{k}: 1' for k in range(2000)), 'more than 500 values'),
         ('/**: {ros__parameters: {}, a: 1}', 'values beside ros__parameters, which ROS refuses'),
         ('grid: &a {n_bins: 9}\nlabel: *a', 'line 2: aliases (*name) are not accepted'),
         ('grid: {r_min: 20.0, r_max: 10.0}', 'grid.r_min = 20: must be below grid.r_max = 10'),
