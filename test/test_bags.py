@@ -17,9 +17,9 @@ from rosbags.interfaces import QosReliability
 from rosbags.typesys import Stores, get_typestore
 
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.data.atomic_output import leftovers, staged_files
 from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag, is_bag_folder, resolve_storage
 from gp_ground_seg.data.bags import BagReader, BagWriter
+from gp_ground_seg.data.files import leftovers, staged_files
 from gp_ground_seg.data.point_cloud2 import encode_cloud
 
 SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive.db3', None)]

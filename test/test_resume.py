@@ -6,6 +6,7 @@ import shutil
 import signal
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -175,6 +176,66 @@ def test_what_does_not_fit_is_done_again(harm, said, root, tmp_path, capsys):
     assert run('segment', source, '-o', out) == 0
     n = len(label_files(anew))
     assert capsys.readouterr().out == f'{n} of {n} were finished before\n'
+
+
+def flip(file):
+    """Another content of the same size."""
+    data = bytearray(file.read_bytes())
+    data[7] ^= 1
+    file.write_bytes(data)
+
+
+def test_a_changed_output_is_written_again_and_what_was_there_is_kept(root, tmp_path, capsys):
+    out = tmp_path / 'out'
+    command = ['segment', root, '-o', out]
+    assert run(*command) == 0
+    whole = label_files(out)
+    touched, changed = sorted(out.rglob('*.label'))[:2]
+    touched.touch()  # another time, as of a copy
+    flip(changed)
+    edited = changed.read_bytes()
+    capsys.readouterr()
+    assert run(*command) == 0
+    said = capsys.readouterr()
+    assert said.out.startswith('11 of 12 were finished before\n1 frame, ')
+    note = f'{changed}: was changed since it was written, is {changed.name}.changed now'
+    assert f'gp-ground-seg: note: {note}\n' in said.err
+    assert label_files(out) == whole
+    assert changed.with_name(f'{changed.name}.changed').read_bytes() == edited
+    flip(changed)
+    assert run(*command) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f'{changed}: was changed since it was written, and {changed}.changed is there' in line
+    assert run(*command, '--force') == 0
+    assert label_files(out) == whole
+
+
+def test_all_is_on_disk_before_it_counts_as_finished(root, tmp_path, monkeypatch):
+    """Each file and the folders above it: a power failure leaves no hole in what is finished."""
+    flushed, lines, sync = [], [], os.fsync
+
+    def note(number):
+        path = Path(os.readlink(f'/proc/self/fd/{number}'))
+        if path.name == 'outputs.jsonl':
+            lines.append((path.read_text().splitlines()[-1], set(flushed)))
+        flushed.append(path.parent / path.name[1:].partition('.partial-')[0] or path)
+        flushed.append(path)
+        sync(number)
+
+    monkeypatch.setattr(os, 'fsync', note)
+    out = tmp_path / 'out'
+    assert run('segment', root, '-o', out) == 0
+    begun, *written = lines
+    assert 'to_write' in begun[0] and out / 'parameters.yaml' in begun[1]
+    names = set()
+    for line, before in written:
+        for name in json.loads(line)['written']:
+            names.add(name)
+            assert {out / name, *(out / name).parents} - {*out.parents} <= before
+    assert len(names) == 12
+    flushed.clear()
+    assert run('segment', next(root.rglob('*.bin')), '-o', tmp_path / 'a.label') == 0
+    assert flushed[-1] == tmp_path
 
 
 @pytest.mark.parametrize('line', [b'{', b'[' * 100_000, b'{"written": 3}', b'\xff', b'7', b'null'])

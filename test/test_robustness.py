@@ -18,8 +18,8 @@ from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.core.parameters.config import size_of_tables
-from gp_ground_seg.data.atomic_output import staged_bag_folder
 from gp_ground_seg.data.bags import BagReader
+from gp_ground_seg.data.files import staged_bag_folder
 
 
 def ring_scan(n=4000, seed=0, height=1.73):

@@ -16,8 +16,8 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.log import in_thousands
-from gp_ground_seg.data.atomic_output import staged_files
 from gp_ground_seg.data.bags import BagReader, BagWriter
+from gp_ground_seg.data.files import staged_files
 from gp_ground_seg.data.point_cloud2 import (
     CloudMessage,
     decode_cloud,

@@ -14,7 +14,7 @@ from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.atomic_output import check_writable
+from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.semantic_kitti import read_labels
 from gp_ground_seg.lab.plotting import (
     CAMERA,

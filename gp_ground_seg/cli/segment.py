@@ -15,11 +15,11 @@ from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.export import to_yaml
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.atomic_output import check_writable
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.bag_output import write_bag
 from gp_ground_seg.data.cloud_files import read_file
 from gp_ground_seg.data.cloud_output import FORMATS, LABELS, format_for
+from gp_ground_seg.data.files import check_writable, flush, writing
 from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences
 from gp_ground_seg.lab.scale.cluster import cut
@@ -143,7 +143,10 @@ def _segment_to(target: Path, item: Item, arguments: argparse.Namespace, config:
     bar = options.progress('segment', quiet=arguments.quiet)
     used = options.spare_compiling(config, item.n_clouds)
     results = item.write(GroundSegmenter(used), target.parent)
-    _print_summary(Outcome.of(bar(results, total=item.n_clouds)), target)
+    outcome = Outcome.of(bar(results, total=item.n_clouds))
+    with writing(target):
+        flush(target.parent)
+    _print_summary(outcome, target)
     if not arguments.quiet:
         options.note_spared(config, used)
 
@@ -178,7 +181,7 @@ def _segment_into(
                 compute = partial(segment_block, folder, used)
                 outcomes = runner.map(compute, blocks, count_clouds)
                 for block, outcome in zip(blocks, outcomes, strict=True):
-                    record.add(block)
+                    record.add(block, outcome.written)
                     found = found.joined(outcome)
             _print_summary(found, folder, runner.n_workers)
             if not arguments.quiet:

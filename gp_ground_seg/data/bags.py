@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gp_ground_seg.core.errors import DataError, require
-from gp_ground_seg.data.atomic_output import staged_bag_folder, staged_file
 from gp_ground_seg.data.bag_files import (
     METADATA_FILE,
     PACKED_SUFFIXES,
@@ -34,6 +33,7 @@ from gp_ground_seg.data.bag_files import (
     storage_of,
     writing,
 )
+from gp_ground_seg.data.files import staged_bag_folder, staged_file
 
 
 @functools.cache

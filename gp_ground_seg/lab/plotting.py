@@ -21,8 +21,8 @@ from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.points import check_points
 from gp_ground_seg.core.result import Segmentation
-from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.colours import COLOURS
+from gp_ground_seg.data.files import staged_file, writing
 from gp_ground_seg.lab.scoring.metrics import Labels, check_lengths
 
 DPI, SEGMENT_DPI = 120, 130
@@ -42,7 +42,8 @@ def save(figure: Any, path: str | Path) -> None:
     kind = {'.pdf': 'pdf', '.svg': 'svg'}.get(Path(path).suffix.lower(), 'png')
     # With their dates, and names by chance, no two files would be equal.
     metadata = {'pdf': {'CreationDate': None}, 'svg': {'Date': None}}.get(kind, {})
-    with staged_file(path, force=True) as part, rc_context({'svg.hashsalt': 'gp_ground_seg'}):
+    same_names = rc_context({'svg.hashsalt': 'gp_ground_seg'})
+    with staged_file(path, force=True) as part, same_names, writing(path):
         figure.savefig(part, format=kind, metadata=metadata)
 
 

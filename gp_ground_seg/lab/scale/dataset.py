@@ -16,9 +16,16 @@ from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.atomic_output import PARTIAL_MARK
 from gp_ground_seg.data.cloud_output import encode_output
-from gp_ground_seg.data.files import read_bytes, stamp, write_file
+from gp_ground_seg.data.files import (
+    PARTIAL_MARK,
+    checksum,
+    flush,
+    read_bytes,
+    stamp,
+    write_file,
+    writing,
+)
 from gp_ground_seg.data.inputs import Input
 from gp_ground_seg.lab.scale.cluster import Progress
 
@@ -49,11 +56,13 @@ class Outcome(NamedTuple):
     heights: list[float]  # of the sensor, by the clouds that show it [m]
     tilts: list[tuple[float, float]]  # roll and pitch, by the clouds that show them [rad]
     contradictions: list[str]  # of the clouds that contradict a parameter
+    # By the name of each file that is on disk: its size, time and checksum.
+    written: dict[str, list[object]]
 
     @classmethod
     def of(cls, results: Iterable[Segmentation]) -> Outcome:
         """Sum up clouds, one by one."""
-        found = cls(0, 0, [], [], [], [])
+        found = cls(0, 0, [], [], [], [], {})
         for result in results:
             n_ground = int((result.label == Label.GROUND).sum())
             found = found._replace(
@@ -77,6 +86,7 @@ class Outcome(NamedTuple):
             self.heights + other.heights,
             self.tilts + other.tilts,
             self.contradictions + other.contradictions,
+            {**self.written, **other.written},
         )
 
 
@@ -97,10 +107,16 @@ def write_scans(
 def segment_block(
     folder: Path, config: Config, items: Sequence[Item], progress: Progress
 ) -> Outcome:
-    """Segment items into the files of a folder."""
+    """Segment items into the files of a folder, and have them on disk."""
     segmenter = GroundSegmenter(config)
     results = (result for item in items for result in item.write(segmenter, folder))
-    return Outcome.of(progress(results))
+    outcome = Outcome.of(progress(results))
+    names = [name for item in items for name in item.names]
+    for parent in {parent for name in names for parent in Path(name).parents}:
+        with writing(folder / parent):
+            flush(folder / parent)
+    outcome.written.update({n: [*stamp(folder / n), checksum(folder / n)] for n in names})
+    return outcome
 
 
 def count_clouds(items: Iterable[Item]) -> int:
@@ -112,9 +128,9 @@ class Record:
     """What a folder has of earlier runs: their parameters, and a line for each step of a run.
 
     The first line of a run has the names of the files that it is to write; they were not there, or
-    were to be replaced. Further lines have, by name, size and time of the input and size of the
-    output of the files that are written. While it is in use the record is locked, and nothing is
-    written before `begin`.
+    were to be replaced. Further lines have, by name, size and time of the input, and size, time
+    and checksum of the output, of the files that are written. While it is in use the record is
+    locked, and nothing is written before `begin`.
 
     Parameters
     ----------
@@ -129,6 +145,7 @@ class Record:
         self._file: IO[bytes] | None = None
         self._inputs: dict[Path, tuple[int, str]] = {}
         self._to_write: list[str] = []
+        self._changed: list[str] = []
         self._is_new = False
 
     def find_left(self, items: Sequence[Item], *, force: bool) -> list[Item]:
@@ -158,12 +175,27 @@ class Record:
                 f'{self._folder / foreign[0]}: exists already ({len(foreign)} of {len(wanted)} '
                 'files to write do); --force replaces them'
             )
+        self._changed = [
+            name
+            for name in wanted
+            if name in written
+            and os.path.lexists(self._folder / name)
+            and not self._is_as_written(name, written[name])
+        ]
         return left
 
     def _is_finished(self, item: Item, written: dict[str, list[object]]) -> bool:
-        given = self._inputs[item.path]
-        outputs = ((name, stamp(self._folder / name)[0]) for name in item.names)
-        return all(written.get(name) == [*given, size] for name, size in outputs)
+        """Whether the files of an item are there, of its input as it is now."""
+        given = [*self._inputs[item.path]]
+        known = [(name, written.get(name, [])) for name in item.names]
+        return all(k[:2] == given and self._is_as_written(name, k) for name, k in known)
+
+    def _is_as_written(self, name: str, known: list[object]) -> bool:
+        """Whether a file has the content that was written; it is read if its time is another."""
+        size, time = stamp(self._folder / name)
+        if size < 0 or known[2:3] != [size]:
+            return False
+        return known[3:4] == [time] or known[4:] == [checksum(self._folder / name)]
 
     def _lock(self) -> None:
         """Open the file; the kernel frees its lock with the process, however that ends."""
@@ -195,7 +227,9 @@ class Record:
         for number, line in enumerate(lines[:-1], 1):
             try:
                 entry = json.loads(line)
-                planned.update(map(str, entry.get('to_write', [])))
+                for name in map(str, entry.get('to_write', [])):
+                    planned.add(name)
+                    written.pop(name, None)
                 written.update(
                     {name: [*about] for name, about in entry.get('written', {}).items()}
                 )
@@ -205,30 +239,51 @@ class Record:
         return planned, written
 
     def begin(self, items: Sequence[Item], *, force: bool) -> None:
-        """Note the files of the items: what follows may write them. With `force` begin anew."""
+        """Note the files of the items: what follows may write them. With `force` begin anew.
+
+        Files that were changed since they were written are kept under another name.
+        """
         self._is_new = not self._folder.exists()
-        self._folder.mkdir(parents=True, exist_ok=True)
-        if self._file is None:
-            self._lock()
+        with writing(self._folder):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            flush(self._folder.parent)
+            if self._file is None:
+                self._lock()
         assert self._file is not None
         # The last line of a run that was killed may be cut off.
         known = b'' if force else read_bytes(self._folder / RECORD, _MAX_RECORD_BYTES)
-        self._file.truncate(known.rfind(b'\n') + 1)
+        with writing(self._folder / RECORD):
+            self._file.truncate(known.rfind(b'\n') + 1)
         write_file(self._folder / PARAMETERS, self._parameters.encode())
+        for name in self._changed:
+            self._put_aside(self._folder / name)
         self._to_write = [name for item in items for name in item.names]
         self._append({'to_write': self._to_write})
+        with writing(self._folder):
+            flush(self._folder)
 
-    def add(self, items: Iterable[Item]) -> None:
-        """Note that the files of the items are written."""
-        written = {}
-        for item in items:
-            given = self._inputs[item.path]
-            written.update({n: [*given, stamp(self._folder / n)[0]] for n in item.names})
+    def _put_aside(self, path: Path) -> None:
+        """Rename a file, which may have been edited by hand."""
+        aside = path.with_name(f'{path.name}.changed')
+        if os.path.lexists(aside):
+            raise DataError(f'{path}: was changed since it was written, and {aside} is there')
+        with writing(aside):
+            os.rename(path, aside)
+        _LOGGER.warning('%s: was changed since it was written, is %s now', path, aside.name)
+
+    def add(self, items: Iterable[Item], outputs: dict[str, list[object]]) -> None:
+        """Note that the files of the items are on disk, as `outputs` say."""
+        written = {n: [*self._inputs[i.path], *outputs[n]] for i in items for n in i.names}
         self._append({'written': written})
 
     def _append(self, entry: dict[str, object]) -> None:
+        """Write a line, and have it on disk."""
         assert self._file is not None
-        self._file.write(json.dumps(entry).encode() + b'\n')
+        data = json.dumps(entry).encode() + b'\n'
+        with writing(self._folder / RECORD):
+            while data:  # a disk that gets full takes a part
+                data = data[self._file.write(data) :]
+            os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Free the lock; a folder that was made for files, of which none is written, goes."""

@@ -19,6 +19,7 @@ import gp_ground_seg
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.export import differences
 from gp_ground_seg.core.parameters.schema import ParameterValue
+from gp_ground_seg.data.files import write_file
 from gp_ground_seg.lab.scale.cluster import package_versions
 
 WIDTH = 100
@@ -158,7 +159,7 @@ def _plain(value: Any) -> Any:
 def write_json(document: Any, path: str | Path) -> None:
     """Write a document as JSON, NaN as null."""
     text = json.dumps(_plain(document), indent=2, allow_nan=False) + '\n'
-    Path(path).write_text(text, encoding='utf-8')
+    write_file(Path(path), text.encode())
 
 
 def describe_environment(*packages: str) -> dict[str, Any]:
