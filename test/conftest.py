@@ -22,6 +22,12 @@ from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 settings.register_profile('default', deadline=None)
 settings.load_profile('default')
 
+
+def pytest_configure(config):
+    # Not in pyproject.toml: there it holds where plugins are imported too, as launch_testing is.
+    config.addinivalue_line('filterwarnings', 'error')
+
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 ROAD, OTHER_OBJECT = 40, 99  # classes of SemanticKITTI
 
