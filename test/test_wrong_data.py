@@ -15,8 +15,7 @@ from evaluation_samples import write_frame
 
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.data.cloud_files import read_file
-from gp_ground_seg.data.scan_layout import find_objection
+from gp_ground_seg.data.cloud_files import find_objection, read_file
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
 
 SPARSE = 300 * 10**9

@@ -20,9 +20,9 @@ from gp_ground_seg.core.jit import has_to_compile
 from gp_ground_seg.core.parameters.config import PRESETS, Config, find_preset
 from gp_ground_seg.core.parameters.export import differences, yaml_scalar
 from gp_ground_seg.core.parameters.schema import YAML_SUFFIXES, did_you_mean, load_yaml
+from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, MIN_COLUMNS
 from gp_ground_seg.data.files import leftovers, staged_file
 from gp_ground_seg.data.inputs import Inputs, list_inputs
-from gp_ground_seg.data.scan_layout import KITTI_COLUMNS, MIN_COLUMNS
 from gp_ground_seg.lab.scale.cluster import Runner, open_runner
 
 DEFAULT_PRESET = 'default'

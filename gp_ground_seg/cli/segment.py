@@ -16,9 +16,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.export import to_yaml
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
-from gp_ground_seg.data.bag_output import write_bag
-from gp_ground_seg.data.cloud_files import read_file
-from gp_ground_seg.data.cloud_output import FORMATS, LABELS, format_for
+from gp_ground_seg.data.cloud_files import FORMATS, LABELS, format_for, read_file
 from gp_ground_seg.data.files import check_writable, flush, writing
 from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences
@@ -31,6 +29,7 @@ from gp_ground_seg.lab.scale.dataset import (
     count_clouds,
     segment_block,
     sweep,
+    write_bag,
     write_scans,
 )
 

@@ -1,6 +1,8 @@
-"""Point clouds in files, their format known by the suffix; those of numpy are read here.
+"""Point clouds in files, their format known by the suffix; numpy's and ``.bin`` are read here.
 
-``.npy`` is one table or structured array, ``.npz`` has an array for each field, or one table.
+``.npy`` is one table or structured array, ``.npz`` has an array for each field, or one table. A
+``.bin`` carries no description. Read with another number of columns most files still give numbers,
+and numbers still give labels: whether they can be those of a scan is checked first.
 """
 
 from __future__ import annotations
@@ -17,6 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError, GroundSegError, PointCloudError, in_one_line
+from gp_ground_seg.core.frame import Label
+from gp_ground_seg.core.pipeline.points import finite_points, objection_to_ranges
+from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.clouds import (
     Cloud,
     Columns,
@@ -32,9 +37,21 @@ from gp_ground_seg.data.clouds import (
 from gp_ground_seg.data.files import MAX_SCAN_BYTES, read_bytes
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
-from gp_ground_seg.data.scan_layout import KITTI_COLUMNS, check_scan, four_columns, read_scan
 
 NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
+KITTI_COLUMNS = 4
+MIN_COLUMNS = 3
+_OTHER_COLUMNS = range(MIN_COLUMNS, 9)  # that are looked at in doubt
+
+_MIN_POINTS = 100  # fewer are not judged
+_N_JUDGED = 10_000  # points looked at in a larger scan
+_N_DISTANCES = 2_000  # of successive points, that are looked at
+_SMALLEST = 1e-6  # of a coordinate that can be measured [m]
+_MAX_UNMEASURABLE = 0.4  # share of them; z may be zero in a whole scan
+# Three quarters of the points of the other number are that much nearer to the next one than the
+# median of the given number. Beams that fire in turns are far from each other, and every second
+# point of them is near to the next: multiples of the given number are not compared.
+_MUCH_NEARER = 4.0
 TABLE = 'points'  # array of an .npz that is a table (N, >= 3), beside fields (N,)
 
 
@@ -113,6 +130,11 @@ _READERS: dict[str, Callable[[bytes], tuple[Fields, Any]]] = {
 _ENCODERS = {'.pcd': encode_pcd, '.ply': encode_ply, '.npy': _encode_npy, '.npz': _encode_npz}
 SUFFIXES = ('.bin', *_READERS)
 WRITABLE = tuple(_ENCODERS)
+LABELS = 'label'
+FORMATS = (LABELS, *(suffix[1:] for suffix in WRITABLE))
+# Unlabelled, road and other-object.
+SEMANTIC_KITTI_CODE = {Label.UNKNOWN: 0, Label.GROUND: 40, Label.OBSTACLE: 99}
+_VALUES = ('height', 'ground_z', 'ground_std', 'p_ground')
 TEXT_SUFFIXES = ('.xyz', '.txt', '.csv')
 """Files of text, whose columns nobody knows but their author."""
 FROM_TEXT = 'a text of points: load it by numpy.loadtxt or pandas.read_csv, save x y z as .npy'
@@ -152,6 +174,25 @@ def encode_file(path: Path, cloud: Cloud, columns: Columns) -> bytes:
         return _ENCODERS[path.suffix](cloud.join(columns))
 
 
+def format_for(path: Path, wanted: str | None) -> str:
+    """One of `FORMATS` for the output of a scan: by default its own, and labels of ``.bin``."""
+    suffix = path.suffix.lower()[1:]
+    return wanted or (suffix if suffix in FORMATS else LABELS)
+
+
+def encode_output(path: Path, cloud: Cloud, result: Segmentation) -> bytes:
+    """File of a cloud with its labels, of the format of `path`; DataError if none can be.
+
+    A ``.label`` has a uint32 for each point, SemanticKITTI's code. Other files have every field of
+    the cloud, label and values of each point.
+    """
+    if path.suffix[1:] == LABELS:
+        codes = [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
+        return np.array(codes, dtype='<u4')[result.label].tobytes()
+    values = {name: getattr(result, name).astype(np.float32) for name in _VALUES}
+    return encode_file(path, cloud, {'label': result.label, **values})
+
+
 @contextmanager
 def _named(path: Path, what: str) -> Iterator[None]:
     """Raise what goes wrong in the block as a DataError with the name of the file."""
@@ -164,3 +205,88 @@ def _named(path: Path, what: str) -> Iterator[None]:
     except Exception as error:  # Of many types: ValueError, struct.error, zlib.error, ...
         said = f'{type(error).__name__}: {in_one_line(error)}'
         raise DataError(f'{path}: {what} as {path.suffix} ({said})') from error
+
+
+def read_scan(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[np.float32]:
+    """Read a ``.bin`` file of float32, x, y, z [m] first in each point: (N, columns).
+
+    Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
+    points, or can be no scan.
+    """
+    data = read_bytes(path, MAX_SCAN_BYTES)
+    if len(data) % (4 * columns):
+        raise DataError(
+            f'{path}: {len(data)} bytes is not a whole number of points of {columns} float32: '
+            'truncated? --columns chooses another number'
+        )
+    numbers = np.frombuffer(data, '<f4').astype(np.float32)
+    table = numbers.reshape(-1, columns)
+    if better := find_columns(numbers, columns):
+        raise DataError(
+            f'{path}: read with {columns} columns its successive points lie far apart, with '
+            f'{better} close together: use --columns {better}'
+        )
+    check_scan(path, table)
+    return table
+
+
+def find_columns(numbers: npt.NDArray[np.float32], columns: int) -> int:
+    """Return the number of columns with which this is a scan of much nearer points; 0 if none."""
+    if len(numbers) < _MIN_POINTS * columns:
+        return 0
+    fitting = [n for n in _OTHER_COLUMNS if len(numbers) % n == 0 and columns % n and n % columns]
+    distances = {n: _distance(numbers, n, 0.75) for n in fitting}
+    best = min(distances, key=distances.__getitem__, default=0)
+    given = _distance(numbers, columns, 0.5)
+    if not best or _MUCH_NEARER * distances[best] >= given:
+        return 0
+    return 0 if find_objection(numbers.reshape(-1, best)[:, :3]) else best
+
+
+def _distance(numbers: npt.NDArray[np.float32], columns: int, share: float) -> float:
+    """Distance [m] that this share of successive finite points is not beyond; or infinity."""
+    xyz = numbers.reshape(-1, columns)[:, :3]
+    first = np.arange(0, len(xyz) - 1, 1 + len(xyz) // _N_DISTANCES)
+    with np.errstate(all='ignore'):
+        distance = np.linalg.norm(xyz[first + 1].astype(np.float64) - xyz[first], axis=1)
+    distance = distance[np.isfinite(distance)]
+    return float(np.quantile(distance, share)) if len(distance) else np.inf
+
+
+def four_columns(table: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+    """Return x, y, z, intensity of a table (N, >= 3), (N, 4); a missing intensity is zero."""
+    points = np.zeros((len(table), 4), dtype=np.float32)
+    points[:, : table.shape[1]] = table[:, :4]
+    return points
+
+
+def check_scan(place: str | Path, xyz: npt.NDArray[np.floating]) -> None:
+    """Raise DataError, with the file or message, where points (N, >= 3) can be no scan."""
+    with np.errstate(all='ignore'):
+        problem = find_objection(xyz[:, :3])
+    if problem:
+        is_bin = str(place).endswith('.bin')
+        more = '; a .bin holds float32: --columns chooses their number' if is_bin else ''
+        raise DataError(f'{place}: {problem}{more}')
+
+
+def find_objection(xyz: npt.NDArray[np.floating]) -> str:
+    """Return why points (N, 3) can be no scan, or ''."""
+    # All are looked at where some of them raise a doubt.
+    return _objection(xyz[:: 1 + len(xyz) // _N_JUDGED]) and _objection(xyz)
+
+
+def _objection(xyz: npt.NDArray[np.floating]) -> str:
+    finite = xyz[finite_points(xyz)]
+    if not len(finite):
+        return f'none of {len(xyz)} points is finite' if len(xyz) else 'no points in it'
+    if problem := objection_to_ranges(finite):
+        return problem
+    if len(xyz) < _MIN_POINTS:
+        return ''
+    # Some drivers put rays without a return at the origin.
+    returned = finite[(finite != 0.0).any(axis=1)]
+    if not len(returned):
+        return 'all points are at the origin'
+    share = float(np.mean(np.abs(returned) < _SMALLEST))
+    return f'{share:.0%} of the coordinates are below 1e-6 m' if share > _MAX_UNMEASURABLE else ''

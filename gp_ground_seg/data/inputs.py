@@ -17,6 +17,7 @@ from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.cloud_files import (
     FROM_TEXT,
+    KITTI_COLUMNS,
     NUSCENES_SUFFIX,
     SUFFIXES,
     TEXT_SUFFIXES,
@@ -24,7 +25,6 @@ from gp_ground_seg.data.cloud_files import (
 )
 from gp_ground_seg.data.clouds import Cloud
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_fields, read_xyz
-from gp_ground_seg.data.scan_layout import KITTI_COLUMNS
 
 # Where the scans are in a sequence of SemanticKITTI or a root of nuScenes, and those sequences.
 _SCAN_FOLDERS = ('.', 'velodyne', 'samples/LIDAR_TOP')

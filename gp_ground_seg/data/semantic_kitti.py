@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.frame import BoolArray
+from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, four_columns, read_scan
 from gp_ground_seg.data.files import read_bytes
-from gp_ground_seg.data.scan_layout import KITTI_COLUMNS, four_columns, read_scan
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70
