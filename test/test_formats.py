@@ -386,12 +386,29 @@ LIES = {
         .replace(b'POINTS 4', b'POINTS 0'),
         '500000004 numbers per point',
     ),
+    'bytes.pcd': (
+        padded_pcd().replace(b'1 1 10', b'1 1 4294967295'), '4294967317 bytes per point'
+    ),
+    'size.pcd': (
+        descriptor_pcd().replace(b'SIZE 4 4 4 4', b'SIZE 4 4 4 2147483647'),
+        'SIZE 2147483647: must be a whole number, at most 65536',
+    ),
+    'nowidth.pcd': (padded_pcd().replace(b'WIDTH 2', b'WIDTH'), 'WIDTH : must be a whole number'),
+    'form.pcd': (padded_pcd().replace(b'DATA binary', b'DATA\xff'), 'DATA : must be ascii'),
     'type.pcd': (padded_pcd().replace(b'TYPE F', b'TYPE X'), 'field x: no type X of 4 bytes'),
     'data.pcd': (padded_pcd().replace(b'DATA binary', b'DATA other'), 'DATA other: must be'),
     'none.pcd': (b'no header', 'no DATA line'),
     'list.ply': (
         ply(['format ascii 1.0', 'element vertex 1', 'property list uchar int x'], b'1 1\n'),
         'property x of the vertices: is a list',
+    ),
+    'element.ply': (
+        ply(['format ascii 1.0', 'element vertex'], b''),
+        "line 'element vertex' of its header cannot be read",
+    ),
+    'property.ply': (
+        ply(['format ascii 1.0', 'property float x'], b''),
+        "line 'property float x' of its header cannot be read",
     ),
     'many.ply': (FOREIGN['pcl.ply'][0].replace(b'vertex 4', b'vertex 4000000'), '4000000 points'),
     'faces.ply': (ply(['format ascii 1.0', 'element face 0'], b''), 'no vertices of a PLY in it'),

@@ -221,6 +221,14 @@ def test_a_column_that_is_no_single_number_is_refused(changes, n_points):
         read_columns(kitti_layout(width=n_points, **in_z(**changes)), ['x', 'z'])
 
 
+@pytest.mark.parametrize(('offset', 'count'), [(13, 1), (12, 2), (2**31 - 1, 1), (4, 2**30)])
+def test_a_field_beyond_its_point_is_refused_where_every_field_is_read(offset, count):
+    """numpy adds in 32 bits: an offset of 2^31 - 1 ended the process."""
+    fields = replaced('intensity', offset=offset, count=count)
+    with pytest.raises(PointCloudError, match=f'intensity at offset {offset} .*point_step 16'):
+        point_cloud2.read_fields(kitti_layout(fields=fields))
+
+
 def test_select_and_append_refuse_what_they_cannot_read():
     keep, short = np.ones(5, dtype=bool), kitti_layout(data=bytes(70))
     with pytest.raises(PointCloudError, match=r'data of 70 bytes: must be at least 80'):

@@ -26,6 +26,7 @@ from rclpy.serialization import serialize_message
 from ros_helpers import SETTERS, linked_process, street, to_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointField
+from torture_fuzz import fuzz, samples_of_readers
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
 from gp_ground_seg.cli import main as cli
@@ -35,7 +36,8 @@ from gp_ground_seg.data.cloud_files import WRITABLE, encode_file
 from gp_ground_seg.data.clouds import cloud_of, name_columns
 
 TEST = Path(__file__).parent
-PARTS = {'clouds': (1000, 100), 'allocator': (100, 50), 'files': (600, 200), 'ros': (400, 200)}
+PARTS = {'clouds': (1000, 100), 'allocator': (100, 50), 'files': (600, 200), 'ros': (400, 200),
+         'readers': (300, 30)}  # fmt: skip
 """Number of cases of a short campaign, and of a process."""
 DEBUGGING = {'PYTHONMALLOC': 'debug', 'MALLOC_PERTURB_': '165'}
 """Environment of the clouds of `allocator`."""
@@ -409,6 +411,11 @@ def case_of(part):
     if part in ('clouds', 'allocator'):
         warnings.simplefilter('error')
         yield try_cloud
+        return
+    if part == 'readers':
+        warnings.simplefilter('error')
+        all_seeds = samples_of_readers()
+        yield lambda number: fuzz(number, all_seeds)
         return
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
         if part == 'files':

@@ -9,6 +9,7 @@ Source: https://pointclouds.org/documentation/tutorials/pcd_file_format.html, pc
 
 from __future__ import annotations
 
+import math
 import struct
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ from gp_ground_seg.core.errors import PointCloudError, require
 from gp_ground_seg.data.clouds import (
     Cloud,
     Fields,
+    check_numbers,
     distinct,
     gather,
     in_types,
@@ -29,6 +31,7 @@ from gp_ground_seg.data.clouds import (
 )
 
 _MAX_EXPANSION = 88  # of LZF: three bytes repeat 264 at most
+_MAX_BYTES = 1 << 16  # of a point
 _SHAPE = ('WIDTH', 'HEIGHT', 'POINTS')
 _TYPES = {f'{kind}{n}' for kind in 'iu' for n in (1, 2, 4, 8)} | {'f4', 'f8'}
 
@@ -54,7 +57,7 @@ def read_pcd(data: bytes) -> tuple[Fields, PcdHeader]:
         raise PointCloudError('no FIELDS line in its header')
     width, height = _shape_of(entries)
     types = _types_of(names, entries)
-    form = ' '.join(entries['DATA']).lower()
+    form = ' '.join(entries.get('DATA', ())).lower()
     if form == 'binary_compressed':
         packed = np.dtype([entry for entry in types if not entry[0].startswith('_ ')])
         fields = _read_compressed(rest, packed, width * height)
@@ -71,15 +74,22 @@ def read_pcd(data: bytes) -> tuple[Fields, PcdHeader]:
 
 def _shape_of(entries: dict[str, list[str]]) -> tuple[int, int]:
     """Width and height of a header; PointCloudError if they contradict its number of points."""
-    given = {key: int(words[0]) for key, words in entries.items() if key in _SHAPE}
+    given = {key: _number(key, ' '.join(entries[key])) for key in _SHAPE if key in entries}
     if not {'WIDTH', 'POINTS'} & given.keys():
         raise PointCloudError('no WIDTH or POINTS line in its header')
     height = given.get('HEIGHT', 1)
     width = given['WIDTH'] if 'WIDTH' in given else given['POINTS'] // max(height, 1)
     n_points = given.get('POINTS', width * height)
-    if min(width, height) < 0 or n_points != width * height:
+    if n_points != width * height:
         raise PointCloudError(f'{n_points} points, which is not width {width} * height {height}')
     return width, height
+
+
+def _number(key: str, word: str, most: int = 1 << 32) -> int:
+    """Whole number of a header; PointCloudError if it is none, or larger than `most`."""
+    if not (word.isdecimal() and len(word) < 12 and int(word) <= most):
+        raise PointCloudError(f'{key} {word}: must be a whole number, at most {most}')
+    return int(word)
 
 
 def _types_of(names: list[str], entries: dict[str, list[str]]) -> list[tuple[str, str, Any]]:
@@ -92,15 +102,21 @@ def _types_of(names: list[str], entries: dict[str, list[str]]) -> list[tuple[str
         counts = ', '.join(f'{len(column)} {key}' for key, column in pairs)
         raise PointCloudError(f'{len(names)} FIELDS, but {counts}; spaces in a name?')
     for name, kind, size, count in zip(distinct(names), *columns, strict=True):
-        code, shape = f'{kind.lower()}{size}', () if count == '1' else (int(count),)
+        code, shape = f'{kind.lower()}{size}', () if count == '1' else (_number('COUNT', count),)
         if names[len(types)] == '_':
             name = f'_ {len(types)}'
         elif code not in _TYPES and name.lower() in ('x', 'y', 'z'):
             raise PointCloudError(f'field {name}: no type {kind} of {size} bytes')
         elif code not in _TYPES:
+            code = f'V{_number("SIZE", size, _MAX_BYTES)}'
             note(f'field {name}: no type {kind} of {size} bytes; left out')
-            name, code = f'{name} ', f'V{int(size)}'
+            name += ' '
         types.append((name, f'<{code}', shape))
+    check_numbers(sum(math.prod(shape) for name, _, shape in types if name[:2] != '_ '))
+    # numpy adds them in 32 bits, and would read outside of the file.
+    n_bytes = sum(np.dtype(code).itemsize * math.prod(shape) for _, code, shape in types)
+    if n_bytes > _MAX_BYTES:
+        raise PointCloudError(f'{n_bytes} bytes per point, accepted are at most {_MAX_BYTES}')
     return types
 
 

@@ -57,7 +57,7 @@ class _Element(NamedTuple):
         runs: list[tuple[np.dtype[Any], int, int]] = []
         fields: list[tuple[str, str]] = []
         names = iter(distinct([words[-1] for words in self.properties]))
-        for _, kind, *words in self.properties:
+        for kind, *words in self.properties:
             name, codes = next(names), [_READABLE.get(w.lower()) for w in (kind, *words[:-1])]
             if codes[0]:
                 fields.append((name, f'{order}{codes[0]}'))
@@ -76,30 +76,30 @@ def read_ply(data: bytes) -> tuple[Fields, PlyHeader]:
     form, remarks = '', []
     elements: list[_Element] = []
     for line in lines:
-        words = line.split()
-        if words[0] == 'format':
-            form = words[1].lower()
-        elif words[0] == 'element':
-            elements.append(_Element(words[1].lower(), int(words[2]), []))
-        elif words[0] == 'property':
-            elements[-1].properties.append(words)
-        elif words[0] in ('comment', 'obj_info'):
+        key, *words = line.split()
+        if key in ('comment', 'obj_info'):
             remarks.append(line)
+        elif key == 'format' and words:
+            form = words[0].lower()
+        elif key == 'element' and len(words) > 1 and words[1].isdecimal():
+            elements.append(_Element(words[0].lower(), int(words[1]), []))
+        elif key == 'property' and len(words) > 1 and elements:
+            elements[-1].properties.append(words)
+        elif key in ('format', 'element', 'property'):
+            raise PointCloudError(f'line {line!r} of its header cannot be read')
     names = [element.name for element in elements]
     if lines[0].strip().lower() != 'ply' or form not in _ORDERS or 'vertex' not in names:
         found = ', '.join(names) or 'none'
         raise PointCloudError(f'no vertices of a PLY in it: format {form}, elements {found}')
-    if min(element.n_rows for element in elements) < 0:
-        raise PointCloudError('an element has fewer than 0 rows')
     before, vertex = elements[: names.index('vertex')], elements[names.index('vertex')]
-    left_out = [words[-1] for words in vertex.properties if words[1] == 'list']
+    left_out = [words[-1] for words in vertex.properties if words[0] == 'list']
     if wrong := {'x', 'y', 'z'} & {*left_out}:
         raise PointCloudError(f'property {min(wrong)} of the vertices: is a list')
     if left_out:
         note(f'PLY: lists of the vertices are left out: {", ".join(left_out)}')
     read = _read_text if form == 'ascii' else _read_binary
     fields = read(body, before, vertex, _ORDERS[form])
-    has_long = any(words[1] in _LONG_NAMES.values() for words in vertex.properties)
+    has_long = any(words[0] in _LONG_NAMES.values() for words in vertex.properties)
     return fields.astype(fields.dtype.newbyteorder('=')), PlyHeader(tuple(remarks), has_long)
 
 
@@ -109,7 +109,7 @@ def _read_text(data: bytes, before: list[_Element], vertex: _Element, order: str
     lines = lines[start : start + vertex.n_rows]
     runs = vertex.runs(order)
     if len(runs) > 1:
-        is_list = [words[1] == 'list' for words in vertex.properties]
+        is_list = [words[0] == 'list' for words in vertex.properties]
         lines = [_without_lists(line.split(), is_list) for line in lines]
     types = [(name, run[name]) for run, *_ in runs for name in run.names or ()]
     return read_lines(lines, np.dtype(types), vertex.n_rows)

@@ -99,6 +99,9 @@ def read_fields(cloud: CloudMessage) -> npt.NDArray[np.void]:
             shape = () if field.count < 2 else (field.count,)
             layout['formats'].append((_code(cloud, field.datatype), shape))
             layout['offsets'].append(field.offset)
+            # numpy adds in 32 bits, and would read outside of the data.
+            if problem := _find_problem_of_place(field, cloud.point_step):
+                raise ValueError(f'{field.name} {problem}')
         dtype = np.dtype(layout)
     except (KeyError, ValueError) as error:
         raise PointCloudError(f'point cloud: fields: {in_one_line(error)}') from error
@@ -210,11 +213,18 @@ def _check_field(field: Any, accepted: Collection[int], point_step: int) -> None
     # Some old writers leave count at 0 and mean 1; PCL reads these too.
     elif field.count not in (0, 1):
         problem = f'has count {field.count}: must be 1'
-    elif not 0 <= field.offset <= point_step - int(_CODES[field.datatype][1]):
-        place = f'at offset {field.offset} of {_CODES[field.datatype][1]} bytes'
-        problem = f'{place}: must end within point_step {point_step}'
+    else:
+        problem = _find_problem_of_place(field, point_step)
     if problem:
         raise PointCloudError(f'point cloud: field {field.name} {problem}')
+
+
+def _find_problem_of_place(field: Any, point_step: int) -> str:
+    """Say that the numbers of a field are not all within the point; empty if they are."""
+    n_bytes = max(field.count, 1) * int(_CODES[field.datatype][1])
+    if 0 <= field.offset <= point_step - n_bytes:
+        return ''
+    return f'at offset {field.offset} of {n_bytes} bytes: must end within point_step {point_step}'
 
 
 def _view(cloud: CloudMessage, code: npt.DTypeLike, offset: int = 0) -> npt.NDArray[Any]:
