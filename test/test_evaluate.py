@@ -24,7 +24,7 @@ from gp_ground_seg.lab.scoring.comparison import iou_measure
 from gp_ground_seg.lab.scoring.evaluate import OurMethod
 from gp_ground_seg.lab.scoring.frames import KEYS, each, make_scores, sums, with_all
 from gp_ground_seg.lab.scoring.metrics import COUNTS, label_ratios
-from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
+from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
 
 
 def evaluate(root, *methods, **options):

@@ -10,11 +10,15 @@ from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.parameters.config import PRESETS
 from gp_ground_seg.data.semantic_kitti import labelled_frames
-from gp_ground_seg.lab.experiments import ablation, interpolation, scenes, variants
+from gp_ground_seg.lab.experiments import ablation, scenes, variants
 from gp_ground_seg.lab.experiments.ablation import MODELS
 from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.scoring.metrics import count_labels, height_sums, label_ratios
-from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
+from gp_ground_seg.lab.scoring.peers import (
+    InterpolationMethod,
+    PatchworkppMethod,
+    ground_points,
+)
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, Kind, simulate_scan
 
 FIXED = Config().replace(**{'learning.mode': 'fixed'})
@@ -87,19 +91,19 @@ def test_steps_go_from_the_paper_to_the_defaults():
 def test_interpolation_joins_lowest_points_that_are_not_too_steep():
     r, z = np.array([5.0, 6.0, 10.0, 20.0]), np.array([-1.7, -1.0, -1.2, -3.0])
     # 0.7 m within 1 m is an obstacle, 0.5 m within 5 m a slope, and so is 1.8 m down in 10 m not.
-    assert interpolation.ground_points(r, z, -1.73) == ([0.0, 5.0, 10.0], [-1.73, -1.7, -1.2])
+    assert ground_points(r, z, -1.73) == ([0.0, 5.0, 10.0], [-1.73, -1.7, -1.2])
 
 
 def test_interpolation_has_the_median_of_three_segments_and_our_labels(frames):
     scan = runner.load_kitti(frames[0])
-    plain = interpolation.interpolation_method(Config())
+    plain = InterpolationMethod(Config())
     plain.run(scan.points)
     result = plain.last
     candidates, surface, segment = result.candidates, result.surface, 60
     lines = []
     for k in (segment - 1, segment, segment + 1):
         own = candidates.segment == k
-        found = interpolation.ground_points(candidates.r[own], candidates.z[own], -1.73)
+        found = ground_points(candidates.r[own], candidates.z[own], -1.73)
         lines.append(np.interp(surface.knots, *found))
     known = np.isfinite(surface.mean[segment])
     assert known.sum() > 5

@@ -29,7 +29,7 @@ from gp_ground_seg.lab.scoring.evaluate import (
 from gp_ground_seg.lab.scoring.frames import Scores, sums
 from gp_ground_seg.lab.scoring.metrics import label_ratios
 from gp_ground_seg.lab.scoring.objects import CUT_HEIGHT
-from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
+from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
 
 DESCRIPTION = """\
 Segment labelled frames and score the labels in both conventions of the field: precision,

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.parameters.config import Config, find_preset, find_spec
-from gp_ground_seg.lab.experiments.interpolation import interpolation_method
 from gp_ground_seg.lab.experiments.variants import Changes, refuse_changed, score_variants
 from gp_ground_seg.lab.scale.cluster import HERE, Runner
 from gp_ground_seg.lab.scoring.comparison import (
@@ -22,7 +21,7 @@ from gp_ground_seg.lab.scoring.comparison import (
 from gp_ground_seg.lab.scoring.evaluate import Method, title_of
 from gp_ground_seg.lab.scoring.frames import Scores, sums
 from gp_ground_seg.lab.scoring.metrics import Measure
-from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
+from gp_ground_seg.lab.scoring.peers import InterpolationMethod, PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import (
     Column,
     Report,
@@ -85,7 +84,7 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     """
     refuse_changed(config, {name for changes in MODELS.values() for name in changes}, _ALL)
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
-    scores = score_variants(items, variants, [interpolation_method(config)], runner=runner)
+    scores = score_variants(items, variants, [InterpolationMethod(config)], runner=runner)
     pooled = sums(scores.scans)
     columns = {
         Column('method'): scores.methods,
@@ -154,7 +153,7 @@ def compare_steps(
     if config != Config():
         raise ConfigError('steps: goes from the preset paper to the defaults, give no parameters')
     steps = paper_steps()
-    peers: list[Method] = [interpolation_method(config)]
+    peers: list[Method] = [InterpolationMethod(config)]
     peers += [PatchworkppMethod()] if with_peer else []
     scores = score_variants(items, steps, peers, runner=runner)
     pooled, iou = sums(scores.scans), _iou(scores)

@@ -21,7 +21,7 @@ from gp_ground_seg.lab.scoring.evaluate import (
     title_of,
 )
 from gp_ground_seg.lab.scoring.frames import Scores
-from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
+from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import Column, Report, Table
 from gp_ground_seg.lab.scoring.tables import make_report
 

@@ -25,7 +25,7 @@ from gp_ground_seg.lab.scoring.evaluate import (
 )
 from gp_ground_seg.lab.scoring.frames import Scores, make_scores
 from gp_ground_seg.lab.scoring.objects import CLASSES, LOW_CLASSES, LOW_HEIGHTS, Objects
-from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
+from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
 from gp_ground_seg.lab.simulation import PLACES, SCENES, SENSORS, Kind, Scene, simulate_scan
 from gp_ground_seg.lab.simulation.objects import object_heights
 from gp_ground_seg.lab.simulation.scan import SimulatedScan
