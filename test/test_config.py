@@ -125,6 +125,12 @@ def test_a_box_is_six_numbers_or_none():
             spec.check(value)
 
 
+def test_a_box_may_be_written_by_launch_ros(from_text):
+    lines = ''.join(f'        - {bound}\n' for bound in BOX)
+    text = f'/**:\n  ros__parameters:\n      input.crop_box: !!python/tuple\n{lines}'
+    assert from_text(text).input.crop_box == BOX
+
+
 def test_groups_given_whole_are_checked_and_converted():
     groups = {field.name: field.default for field in dataclasses.fields(Config)}
     label = dataclasses.replace(groups['label'], ground_tolerance=1)

@@ -64,6 +64,11 @@ WORDS = {
     'log level': ('--log-level loud', 'does not use a valid severity level'),
     'reliability': (f'-p {QOS}.reliability:=maybe', 'policy `reliability`: `maybe`'),
     'depth': (f'-p {QOS}.depth:=-3', 'depth = -3: must be an integer in [1, 10000]'),
+    'box': (
+        '-p input.crop_box:=[1.0,0.0,0.0,1.0,0.0,1.0]',
+        'must be none or six numbers in [-100',
+    ),
+    'empty list': ('-p input.crop_box:=[]', 'null or an empty list'),
     'depth type': (f'-p {QOS}.depth:=many', "expecting type 'INTEGER'"),
 }
 

@@ -36,6 +36,7 @@ from gp_ground_seg.core.parameters.schema import ROS_PARAMETERS_KEY, read_yaml
 HIGHEST_DOMAIN = 232
 _MOST_KEYS = 10  # of a parameter file that are listed
 LOG_FOLDER = 'set ROS_LOG_DIR to a folder that the node may write to'
+NO_VALUE = ': a value is null or an empty list, which ROS does not read; no input.crop_box is none'
 ROS_WHEELS = "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
 
 
@@ -80,6 +81,7 @@ def start_errors() -> Iterator[None]:
         kind = type(error).__name__
         is_of_log = text.startswith(('failed to initialize logging', 'Failed opening file'))
         text += f': {LOG_FOLDER}' if is_of_log else ''
+        text += NO_VALUE if 'PARAMETER_NOT_SET' in text else ''
         raise ConfigError(text if kind == 'RCLError' else f'{kind}: {text}') from error
 
 

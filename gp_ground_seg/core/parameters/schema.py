@@ -290,7 +290,13 @@ def _construct_int(loader: _Loader, node: yaml.ScalarNode) -> int:
     return loader.construct_yaml_int(node)
 
 
+def _construct_list(loader: _Loader, node: yaml.SequenceNode) -> list[Any]:
+    """Read what launch_ros writes for a list, which rcl reads as one."""
+    return loader.construct_sequence(node)
+
+
 _Loader.add_constructor('tag:yaml.org,2002:int', _construct_int)
+_Loader.add_constructor('tag:yaml.org,2002:python/tuple', _construct_list)
 _Loader.add_implicit_resolver(
     'tag:yaml.org,2002:float',
     re.compile(r'^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$'),
