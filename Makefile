@@ -47,9 +47,9 @@ $(VENV)/.docs: setup.py $(VENV)/.dev
 demo: $(VENV)/.ros
 	$(BIN)/gp-ground-seg demo --force
 
-# A test that hangs fails after so many seconds, with a traceback; the slowest runs `make test`.
+# A test that hangs fails after so many seconds, with a traceback. Two processes share the modules.
 test: $(VENV)/.dev
-	$(WITH_KITTI) $(BIN)/python -m pytest --timeout=300 -m 'not slow'
+	$(WITH_KITTI) $(BIN)/python -m pytest -n 2 --dist loadfile --timeout=300 -m 'not slow'
 
 test-all: $(VENV)/.dev
 	$(WITH_KITTI) $(BIN)/python -m pytest --timeout=1500

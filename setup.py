@@ -43,6 +43,7 @@ DEV = [
     'pypatchworkpp>=1.4',
     'pypcd4>=1.1',
     'pytest-timeout>=2.3',
+    'pytest-xdist>=3.5',
     'ruff>=0.6,<0.18',
     'scikit-learn>=1.4',
     'selenium>=4.20',

@@ -42,7 +42,7 @@ PATIENCE = 120.0
 _WORKER = os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw')
 _SESSION = os.getppid() if _WORKER else os.getpid()
 DOMAIN_ID = 1 + (4 * _SESSION + int(_WORKER or 0)) % 100
-NAMESPACE = f'/test_{os.getpid()}'
+NAMESPACE = f'/test_{_SESSION}'
 ISOLATION = {
     'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
     'ROS_DOMAIN_ID': str(DOMAIN_ID),
