@@ -12,7 +12,7 @@ from gp_ground_seg.core.frame import BoolArray, PointArray
 from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.data.colours import COLOURS
 from gp_ground_seg.data.costmap import SegmentedCloud
-from gp_ground_seg.lab.plotting.scan import add_axes, legend_dots, new_figure, save, write_line
+from gp_ground_seg.lab.plotting import new_figure, save
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 
 LOW, HIGH = 0.15, 1.5
@@ -35,13 +35,14 @@ def cells_of(xy: PointArray, chosen: BoolArray) -> BoolArray:
 
 def draw(figure: Any, left: float, title: str, layers: dict[str, BoolArray]) -> None:
     """Draw a map from above, x to the right, `left` inches from the edge."""
-    axes = add_axes(figure, left, 0.4, (SIDE, SIDE))
+    width, height = figure.get_size_inches()
+    axes = figure.add_axes((left / width, 0.4 / height, SIDE / width, SIDE / height))
     for name, layer in layers.items():
         places = (np.argwhere(layer) + 0.5) * CELL - REACH
         axes.scatter(*places.T, s=0.8, linewidths=0.0, c=COLOURS[name])
     axes.set_axis_off()
     axes.set_aspect('equal')
-    write_line(figure, title, (left + 0.5 * SIDE) / figure.get_size_inches()[0], 0.15, fontsize=12)
+    axes.set_title(title, fontsize=12)
 
 
 def main(path: str) -> int:
@@ -65,8 +66,9 @@ def main(path: str) -> int:
         numbers = [in_thousands(layers[name].sum()) for name in ('false ground', 'obstacle')]
         said.append(f'marks {numbers[0]} of ground, {numbers[1]} of things')
     names = {'ground': 'ground', 'thing, marked': 'obstacle', 'ground, marked': 'false ground'}
-    dots = legend_dots({shown: COLOURS[name] for shown, name in names.items()}, 7)
-    figure.legend(handles=dots, loc='lower center', fontsize=11, frameon=False, ncols=3)
+    for shown, name in names.items():
+        figure.axes[0].plot([], [], 'o', markersize=7, color=COLOURS[name], label=shown)
+    figure.legend(loc='lower center', fontsize=11, frameon=False, ncols=3)
     save(figure, path)
     n_ground, n_things = (in_thousands(cells.sum()) for cells in (ground, thing))
     print(
