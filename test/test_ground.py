@@ -13,7 +13,7 @@ from scipy.stats import norm
 from gp_ground_seg import Config
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.frame import Frame
-from gp_ground_seg.core.gp.evidence import ODDS, seeds
+from gp_ground_seg.core.gp.evidence import ODDS, highest_ground, seeds
 from gp_ground_seg.core.gp.ground import ODDS_IN_FACE, noise_in_doubt
 from gp_ground_seg.core.gp.learning import given_theta
 
@@ -295,6 +295,20 @@ def frame_of_a_sill(n_walls):
     azimuth = (segment + 0.5) * 2.0 * np.pi / 180.0
     xyz = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), z - 1.73])[seen]
     return frame_of(xyz, config), config
+
+
+def test_ground_rises_around_the_ring_to_both_sides_by_the_arc():
+    config = config_of().replace(**{'grid.n_segments': 12})
+    n_segments, r = 12, config.grid.r_min + 0.01  # in the first bin: no way is shorter
+    azimuth = (np.arange(n_segments) + 0.5) * 2.0 * np.pi / n_segments
+    ring = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full(n_segments, -1.73)])
+    frame = frame_of(ring, config)
+    segment = frame.candidates.segment
+    for start in (0, 5, 11):
+        highest = highest_ground(frame, np.zeros(n_segments), segment == start, max_slope=0.1)
+        steps = np.abs((segment - start + 6) % n_segments - 6)
+        arc = frame.knots[frame.candidates.bin] * 2.0 * np.pi / n_segments
+        np.testing.assert_allclose(highest, 0.1 * arc * steps)
 
 
 @pytest.mark.parametrize('n_walls', [0, 20, 70])

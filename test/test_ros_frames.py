@@ -73,6 +73,10 @@ def test_tilt_of_a_quaternion_is_roll_and_pitch_whatever_the_heading(roll, pitch
     np.testing.assert_allclose(rotation(*found), rotation(roll, pitch), atol=3e-5)
     fixed_axes = Rotation.from_matrix(turn).as_euler('xyz')[:2]
     np.testing.assert_allclose(rotation(*found), rotation(*fixed_axes), atol=3e-5)
+    # What is rounded is a rotation all the same.
+    q = quaternion(turn)
+    rounded = rotation_of(Quaternion(**{name: 1.0003 * getattr(q, name) for name in 'xyzw'}))
+    np.testing.assert_allclose(rounded, turn, atol=1e-9)
 
 
 @pytest.mark.parametrize('w', [0.0, 2.0, math.nan])
