@@ -6,6 +6,7 @@ import sys
 from typing import Any
 
 import numpy as np
+from matplotlib.lines import Line2D
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.frame import BoolArray, PointArray
@@ -42,7 +43,8 @@ def draw(figure: Any, left: float, title: str, layers: dict[str, BoolArray]) -> 
         axes.scatter(*places.T, s=0.8, linewidths=0.0, c=COLOURS[name])
     axes.set_axis_off()
     axes.set_aspect('equal')
-    axes.set_title(title, fontsize=12)
+    place = (left + 0.5 * SIDE) / width, 1.0 - 0.15 / height
+    figure.text(*place, title, ha='center', va='center', fontsize=12)
 
 
 def main(path: str) -> int:
@@ -66,9 +68,13 @@ def main(path: str) -> int:
         numbers = [in_thousands(layers[name].sum()) for name in ('false ground', 'obstacle')]
         said.append(f'marks {numbers[0]} of ground, {numbers[1]} of things')
     names = {'ground': 'ground', 'thing, marked': 'obstacle', 'ground, marked': 'false ground'}
-    for shown, name in names.items():
-        figure.axes[0].plot([], [], 'o', markersize=7, color=COLOURS[name], label=shown)
-    figure.legend(loc='lower center', fontsize=11, frameon=False, ncols=3)
+    dots = [
+        Line2D(
+            [], [], marker='o', markersize=7, color=COLOURS[name], linestyle='none', label=shown
+        )
+        for shown, name in names.items()
+    ]
+    figure.legend(handles=dots, loc='lower center', fontsize=11, frameon=False, ncols=3)
     save(figure, path)
     n_ground, n_things = (in_thousands(cells.sum()) for cells in (ground, thing))
     print(
