@@ -16,9 +16,8 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.parameters.config import GridConfig
 from gp_ground_seg.core.pipeline.polar_grid import build_polar_grid, grid_geometry
-from gp_ground_seg.data.colours import COLOURS
 from gp_ground_seg.lab import plotting as colours
-from gp_ground_seg.lab.plotting import SegmentView, line_ends, plot_segment, segment_at
+from gp_ground_seg.lab.plotting import COLOURS, SegmentView, line_ends, plot_segment, segment_at
 
 SEGMENT = 90
 ROAD, BUILDING = 40, 50

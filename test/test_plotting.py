@@ -13,11 +13,10 @@ from matplotlib.image import imread
 
 from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.core.errors import DataError, MissingDependencyError, PointCloudError
-from gp_ground_seg.data import colours as colours_
-from gp_ground_seg.data.colours import COLOURS
 from gp_ground_seg.lab import plotting
 from gp_ground_seg.lab.plotting import (
     CAMERA,
+    COLOURS,
     TARGET,
     ZOOM,
     camera_at,
@@ -250,7 +249,7 @@ DEFICIENCIES = {
 
 @pytest.mark.parametrize('name', DEFICIENCIES)
 def test_lightness_of_the_colours_rises_for_every_eye(name):
-    colours = colours_.ramp_colours(np.linspace(1.0, 50.0, 30), 1.0, 50.0)
+    colours = plotting.ramp_colours(np.linspace(1.0, 50.0, 30), 1.0, 50.0)
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
     seen = np.clip(linear @ np.transpose(DEFICIENCIES[name]), 0.0, 1.0)
     lightness = 116.0 * np.cbrt(seen @ [0.2126, 0.7152, 0.0722]) - 16.0
@@ -260,8 +259,8 @@ def test_lightness_of_the_colours_rises_for_every_eye(name):
 
 def test_colours_end_at_the_limits_and_nan_is_grey():
     values = np.array([1.0, 50.0, 0.01, 500.0, np.inf, -np.inf, np.nan])
-    ends = colours_.ramp_colours(values, 1.0, 50.0)
+    ends = plotting.ramp_colours(values, 1.0, 50.0)
     np.testing.assert_array_equal(ends[2], ends[0])
     np.testing.assert_array_equal(ends[3], ends[1])
     assert not np.array_equal(ends[0], ends[1])
-    np.testing.assert_array_equal(ends[4:], [colours_.UNKNOWN] * 3)
+    np.testing.assert_array_equal(ends[4:], [plotting.UNKNOWN] * 3)

@@ -10,8 +10,8 @@ from conftest import REPOSITORY
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.data.colours import COLOURS, HEIGHTS
 from gp_ground_seg.data.costmap import SegmentedCloud
+from gp_ground_seg.lab.plotting import COLOURS, HEIGHTS
 
 NODE = '/ground_segmentation_node'
 KINDS = {'scan': 'LaserScan', 'occupancy': 'Map'}

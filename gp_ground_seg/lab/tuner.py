@@ -30,10 +30,9 @@ from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_sp
 from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.colours import COLOURS, HEIGHTS, ramp_colours
 from gp_ground_seg.data.inputs import Input, Inputs
 from gp_ground_seg.data.semantic_kitti import read_entries
-from gp_ground_seg.lab.plotting import CAMERA, GREEN, TARGET
+from gp_ground_seg.lab.plotting import CAMERA, COLOURS, GREEN, HEIGHTS, TARGET, ramp_colours
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_labels, label_ratios
 from gp_ground_seg.lab.scoring.objects import Objects, count_objects, labelled_objects
 
