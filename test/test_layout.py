@@ -10,7 +10,7 @@ import pytest
 from conftest import REPOSITORY
 
 PACKAGE = 'gp_ground_seg'
-MAX_FILES = 136
+MAX_FILES = 122
 
 
 def lint_imports(folder):

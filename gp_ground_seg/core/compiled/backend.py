@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import os
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from gp_ground_seg.core.compiled import (
     evidence,
@@ -20,7 +22,6 @@ from gp_ground_seg.core.compiled import latent as latent_
 from gp_ground_seg.core.compiled import relief as relief_
 from gp_ground_seg.core.compiled import roughness as roughness_
 from gp_ground_seg.core.compiled import vertical_faces as faces_
-from gp_ground_seg.core.compiled.buffers import Buffers
 from gp_ground_seg.core.frame import (
     BoolArray,
     Candidates,
@@ -49,6 +50,48 @@ from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import Direction, copy_points, points_in
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
 from gp_ground_seg.core.pipeline.relief import Relief
+
+
+class Buffers:
+    """Arrays by name, as long as the largest frame so far needed.
+
+    A new array of a megabyte costs as much as a pass over it: its pages are
+    mapped and cleared one by one. What is taken from here must not outlive the frame.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, npt.NDArray[Any]] = {}
+        self._views: dict[str, npt.NDArray[Any]] = {}
+        self._tiles: polar_grid.TileTable | None = None
+
+    def take(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+        """Array of that shape with arbitrary content, C-contiguous.
+
+        Parameters
+        ----------
+        name : str
+            One name, one purpose: a second call with it returns the same memory.
+        shape : tuple of int
+            Shape wanted.
+        dtype : dtype
+            Type of the elements.
+        """
+        view = self._views.get(name)
+        if view is not None and view.shape == shape and view.dtype == dtype:
+            return view
+        size = math.prod(shape)
+        held = self._arrays.get(name)
+        if held is None or len(held) < size or held.dtype != np.dtype(dtype):
+            held = self._arrays[name] = np.empty(size, dtype=dtype)
+        view = self._views[name] = held[:size].reshape(shape)
+        return view
+
+    def tile_table(self, n_tiles: int, dtype: npt.DTypeLike) -> polar_grid.TileTable:
+        """Table as the last scan left it, or a new one of the size wanted."""
+        held = self._tiles
+        if held is None or len(held.extremes) != n_tiles + 1 or held.extremes.dtype != dtype:
+            held = self._tiles = polar_grid.TileTable.empty(n_tiles, dtype)
+        return held
 
 
 class NumbaBackend:

@@ -9,8 +9,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from gp_ground_seg.core.compiled.buffers import TileTable
 from gp_ground_seg.core.frame import (
     NO_TILE,
     NOT_FINITE,
@@ -46,6 +46,30 @@ class CellTable(NamedTuple):
 
     extremes: PointArray
     numbers: CellArray
+
+
+class TileTable(NamedTuple):
+    """Extremes of the points of each tile.
+
+    Attributes
+    ----------
+    extremes : (T + 1, 2) float32 or float64
+        Height of the lowest and the highest point [m]; infinite, minus infinite in empty
+        tiles. The last row is for points in no tile.
+    occupied : (T + 2,) int32
+        Number of tiles with a point, then these tiles. Code that fills the table first empties
+        those, a tenth of all.
+    """
+
+    extremes: PointArray
+    occupied: CellArray
+
+    @classmethod
+    def empty(cls, n_tiles: int, dtype: npt.DTypeLike) -> TileTable:
+        """Table without a point."""
+        extremes = np.empty((n_tiles + 1, 2), dtype=dtype)
+        extremes[:, 0], extremes[:, 1] = np.inf, -np.inf
+        return cls(extremes, np.zeros(n_tiles + 2, dtype=np.int32))
 
 
 class Places(NamedTuple):
