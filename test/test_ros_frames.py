@@ -4,6 +4,7 @@ import dataclasses
 import importlib.util
 import math
 import sys
+import time
 import types
 
 import numpy as np
@@ -324,15 +325,15 @@ BY_IMU = {**VALUES, 'frame.level': 'imu', 'diagnostics.period': 0.1}
 def test_tilt_by_an_imu(monkeypatch):
     points, turn = turned_street(yaw=1.0)
 
-    def cloud(seconds):
-        return to_message(points, stamp=(seconds, 10_000_000), frame='tilted_lidar')
+    def cloud(seconds, nanosec=10_000_000):
+        return to_message(points, stamp=(seconds, nanosec), frame='tilted_lidar')
 
     with bench(*ros.given(BY_IMU)) as b:
         imu = b.probe.create_publisher(Imu, 'imu', 10)
         wait_for(lambda: imu.get_subscription_count() == 1, 'subscription of imu')
 
-        def refused(seconds, reason):
-            b.publisher.publish(cloud(seconds))
+        def refused(seconds, reason, nanosec=10_000_000):
+            b.publisher.publish(cloud(seconds, nanosec))
             return b.wait_for_status('input', lambda _, s: reason in s.message)
 
         refused(2, f'no message on {ros.NAMESPACE}/imu, for frame.level = imu')
@@ -340,12 +341,16 @@ def test_tilt_by_an_imu(monkeypatch):
         monkeypatch.setattr(transforms, 'MAX_WAIT', 60.0)
         b.publisher.publish(cloud(3))
         wait_for(lambda: len(b.node._frames._waiting) == 1, 'cloud that waits')
-        for nanosec, matrix in ((0, np.eye(3)), (9_000_000, turn), (12_000_000, np.eye(3))):
+        imu.publish(imu_message(np.eye(3), (3, 0)))
+        wait_for(lambda: b.node._frames._imu._messages, 'orientation')
+        time.sleep(5 * transforms.REVIEW_PERIOD)
+        assert len(b.node._frames._waiting) == 1
+        for nanosec, matrix in ((9_000_000, turn), (12_000_000, np.eye(3))):
             imu.publish(imu_message(matrix, (3, nanosec)))
         check_levelled(points, cloud(3), (b.ground.wait(1)[0], b.obstacles.wait(1)[0]))
         # Refused: far from it in time, without an orientation, in a frame that is not known.
         monkeypatch.setattr(transforms, 'MAX_WAIT', 0.1)
-        refused(4, 'is 0.998 s from its stamp: must be within 0.05 s')
+        refused(3, 'is 0.058 s from its stamp: must be within 0.05 s', 70_000_000)
         imu.publish(imu_message(turn, (5, 10_000_000), has_orientation=False))
         refused(5, 'orientation_covariance[0] is -1')
         imu.publish(imu_message(turn, (6, 10_000_000), frame='imu_link'))
