@@ -160,8 +160,8 @@ def label_by_bands(
     """Label the points from their heights in `result`, and find tiles of obstacles.
 
     Ground reaches `depth` below the surface. `has_obstacle` (T,) becomes true where a return near
-    the surface is no ground. `roughness` (T + 1,) is that of the ground in each tile [m], and
-    becomes the height of its band; the last one, for points in no tile, is NaN.
+    the surface is no ground. `bands` (T + 1,) is the roughness of the ground in each tile [m], and
+    becomes the largest height of ground there; the last one is for points in no tile.
     """
     for occupied in scan.tiles.occupied:
         bands[np.uintp(occupied)] = ground_band(bands[np.uintp(occupied)], config)

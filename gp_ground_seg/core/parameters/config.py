@@ -399,9 +399,10 @@ _PRESETS = (
     Preset(
         'paper',
         'What arXiv 2112.05847 prints, learned until it converges. Of our departures '
-        '(docs/algorithm.md) it has the three without a switch: latent values are centred on '
-        'their mean in each segment, heights between bin edges are linear, and points without '
-        'a model are obstacles. What the paper leaves open is as in the defaults.',
+        '(docs/algorithm.md) it has the four without a switch: mirror images on a wet road are '
+        'raised, latent values are centred on their mean in each segment, heights between bin '
+        'edges are linear, and points without a model are obstacles. What the paper leaves open '
+        'is as in the defaults.',
         {
             'sensor.height': (1.73, "of KITTI's sensor, the paper's data"),
             'sensor.roll': (0.0, 'nothing is levelled'),
