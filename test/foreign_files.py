@@ -152,6 +152,10 @@ CASES |= {
     'list_between.ply': (ply(MIDDLE, middle_rows(), LE), 'x y z r'),
     'list_between_big.ply': (ply(MIDDLE, middle_rows('>'), BE), 'x y z r'),
     'list_between_text.ply': (ply(MIDDLE, MIDDLE_TEXT), 'x y z r'),
+    'bool.ply': (ply('float x,float y,float z,bool b', rows(b=RING.astype('u1')), LE), 'x y z b'),
+    'unknown_text.ply': (
+        ply('float x,float y,float z,decimal d', with_ring(0, 1, 2, 3)), 'x y z d'
+    ),
     'lists_first.ply': (
         ply('list uchar int v,list uchar int w,float x,float y,float z,list uchar int u',
             b''.join(bytes(2) + row.tobytes() + bytes(1) for row in XYZ), LE),

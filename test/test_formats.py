@@ -362,6 +362,15 @@ LIES = {
     'shape.npz': (
         zip_of(points=npy_header((10**9, 3)) + bytes(10**6)), r'cannot be read as \.npz \('
     ),
+    'turned.npy': (npy_bytes(np.zeros((3, 200), 'f4')), r'\(3, 200\): is transposed'),
+    'nested.npy': (
+        npy_bytes(np.zeros(4, [('p', [('x', 'f4'), ('y', 'f4'), ('z', 'f4')])])),
+        r'no field x of one number per point; fields: p \(4,\)',
+    ),
+    'commas.pcd': (
+        pcd(['FIELDS x y z', 'WIDTH 1', 'DATA ascii'], b'0,1,2\n'),
+        'a line of 1 words, its header says 3, separated by spaces',
+    ),
     'flat.npy': (npy_bytes(np.arange(9.0)), r'array of shape \(9,\): must be \(N, 3\)'),
     'names.npz': (zip_of(a=npy_bytes(XYZ), b=npy_bytes(XYZ)), r'arrays a \(4, 3\), b \(4, 3\):'),
     'flat.npz': (zip_of(a=npy_bytes(np.arange(9.0))), r'arrays a \(9,\): must be x, y, z, or one'),

@@ -52,6 +52,7 @@ _MAX_UNMEASURABLE = 0.4  # share of them; z may be zero in a whole scan
 # median of the given number. Beams that fire in turns are far from each other, and every second
 # point of them is near to the next: multiples of the given number are not compared.
 _MUCH_NEARER = 4.0
+_TRANSPOSED = 20  # columns from which on a table of three or four rows is
 TABLE = 'points'  # array of an .npz that is a table (N, >= 3), beside fields (N,)
 
 
@@ -69,12 +70,22 @@ def _fields_of(arrays: Columns) -> tuple[Fields, Columns]:
     if table is not None and table.dtype.names is None:
         if table.ndim != 2 or table.shape[1] < 3:
             raise PointCloudError(f'array of shape {table.shape}: must be (N, 3) or wider')
+        if table.shape[0] in (3, 4) and table.shape[1] >= _TRANSPOSED:
+            raise PointCloudError(f'array of shape {table.shape}: is transposed; save its .T')
         table = name_columns(table)
     columns = {**({} if table is None else scatter(table.ravel())), **arrays}
     x = coordinate_names(columns)[0]
     shape = columns[x].shape if x in columns else ()
     fields = {name: v for name, v in columns.items() if shape and v.shape[:1] == shape}
+    if not fields:
+        raise PointCloudError(f'no field x of one number per point; fields: {_shapes(columns)}')
     return gather(fields), {name: v for name, v in columns.items() if name not in fields}
+
+
+def _shapes(arrays: Columns) -> str:
+    """Name and shape of each array, cut where they are many."""
+    found = ', '.join(f'{name} {values.shape}' for name, values in arrays.items()) or 'none'
+    return textwrap.shorten(found, 200, placeholder=' ...')
 
 
 def _table_name(arrays: Columns) -> str:
@@ -85,9 +96,8 @@ def _table_name(arrays: Columns) -> str:
         return TABLE
     tables = [name for name, v in arrays.items() if v.dtype.names or v.shape[1:] >= (3,)]
     if len(tables) != 1:
-        found = ', '.join(f'{name} {v.shape}' for name, v in arrays.items()) or 'none'
-        found = textwrap.shorten(found, 200, placeholder=' ...')
-        raise PointCloudError(f'arrays {found}: must be x, y, z, or one array (N, 3) or wider')
+        found = f'arrays {_shapes(arrays)}'
+        raise PointCloudError(f'{found}: must be x, y, z, or one array (N, 3) or wider')
     return tables[0]
 
 

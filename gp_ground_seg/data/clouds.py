@@ -228,8 +228,10 @@ def read_lines(lines: Sequence[bytes], dtype: np.dtype[Any], n_points: int) -> F
         return np.loadtxt(lines[:n_points], dtype, comments=None, ndmin=1)
     except (ValueError, TypeError):
         lines = [_NO_NUMBER.sub(b'nan', line) for line in lines[:n_points]]
-        if min(len(line.split()) for line in lines) < count_numbers(dtype):
-            raise
+        n_words, wanted = min(len(line.split()) for line in lines), count_numbers(dtype)
+        if n_words < wanted:
+            words = f'a line of {n_words} words, its header says {wanted}, separated by spaces'
+            raise PointCloudError(words) from None
     columns, stop = {}, 0
     for name in dtype.names or ():
         start, stop = stop, stop + math.prod(dtype[name].shape)

@@ -34,7 +34,11 @@ _CODES = {
 _NAMES = {code: name for name, code in _CODES.items()}
 _LONG_NAMES = {'i8': 'int64', 'u8': 'uint64'}
 # int8, ..., of newer writers.
-_READABLE = {**_CODES, **{np.dtype(code).name: code for code in (*_NAMES, *_LONG_NAMES, 'f2')}}
+_READABLE = {
+    **_CODES,
+    'bool': 'u1',
+    **{np.dtype(code).name: code for code in (*_NAMES, *_LONG_NAMES, 'f2')},
+}
 _ORDERS = {'ascii': '<', 'binary_little_endian': '<', 'binary_big_endian': '>'}
 
 
@@ -97,6 +101,9 @@ def read_ply(data: bytes) -> tuple[Fields, PlyHeader]:
         raise PointCloudError(f'property {min(wrong)} of the vertices: is a list')
     if left_out:
         note(f'PLY: lists of the vertices are left out: {", ".join(left_out)}')
+    for words in vertex.properties if form == 'ascii' else []:
+        if words[0] != 'list' and words[0].lower() not in _READABLE:
+            words[0] = 'double'  # a text needs no size
     read = _read_text if form == 'ascii' else _read_binary
     fields = read(body, before, vertex, _ORDERS[form])
     has_long = any(words[0] in _LONG_NAMES.values() for words in vertex.properties)
