@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.frame import GroundSurface, Labelled, PolarGrid
+from gp_ground_seg.core.pipeline import residuals
 from gp_ground_seg.core.pipeline.residuals import PRIOR_CELLS, correct_surface
 from gp_ground_seg.lab.simulation import DRIVES, SENSORS, VLP_16, objects, simulate_scan
 from gp_ground_seg.lab.simulation.scenes import Scene
@@ -202,3 +203,19 @@ def test_ground_that_a_car_hides_is_uncertain():
     assert np.median(error) < np.median(wrong)
     assert np.median(error / found.ground_std[roof]) < 2.0
     assert np.median(found.ground_std[roof] / sure) > 2.0
+
+
+@pytest.mark.parametrize('n_segments', [7, 90, 180])
+def test_of_two_knots_as_near_rounding_does_not_choose(n_segments, monkeypatch):
+    """The correction came from the other side on another processor, up to 8 cm away."""
+    rng = np.random.default_rng(0)
+    knots = 2.0 + 118.0 * (np.arange(41) / 40.0) ** 1.5
+    seen = rng.random((n_segments, 41)) < 0.2
+    distance, nearest = residuals._nearest(knots, seen, ~seen)
+    cosine = np.cos
+    for ulps in (-2, -1, 1, 2):
+        # As of a library of another precision.
+        monkeypatch.setattr(np, 'cos', lambda a, n=ulps: cosine(a) * (1.0 + n * 2.0**-52))
+        again, other = residuals._nearest(knots, seen, ~seen)
+        np.testing.assert_array_equal(other, nearest)
+        np.testing.assert_allclose(again, distance, rtol=1e-9)

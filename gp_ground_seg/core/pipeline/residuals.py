@@ -41,6 +41,8 @@ from gp_ground_seg.core.frame import (
 
 PRIOR_CELLS = 0.05
 """Cells that the first guess of the ground's variance counts as much as."""
+PLACES = 2.0**15
+"""Units that places are rounded to [1/m]: their squared distances are whole numbers below 2^53."""
 UNITS = 2.0**20
 """Units that residuals are rounded to [1/m], as the order of whole numbers in a sum is free."""
 
@@ -157,8 +159,14 @@ def _of_both_bins(table: FloatArray) -> FloatArray:
 def _nearest(
     knots: FloatArray, seen: BoolArray, unseen: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Distance [m] of each knot of `unseen` to the nearest of `seen`, and which of them it is."""
+    """Distance [m] of each knot of `unseen` to the nearest of `seen`, and which of them it is.
+
+    Of segments to either side two are as near as each other. Rounding of sines, which differs from
+    processor to processor, must not choose: squared distances of places on a raster are exact.
+    """
     azimuth = 2.0 * np.pi * np.arange(len(seen))[:, None] / len(seen)
     places = np.stack([knots * np.cos(azimuth), knots * np.sin(azimuth)], axis=-1)
-    distance, nearest = cKDTree(places[seen]).query(places[unseen])
+    raster = np.rint(places * PLACES)
+    _, nearest = cKDTree(raster[seen]).query(raster[unseen])
+    distance: FloatArray = np.linalg.norm(places[seen][nearest] - places[unseen], axis=-1)
     return distance, nearest
