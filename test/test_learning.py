@@ -111,6 +111,9 @@ def test_the_end_is_level_or_at_a_bound_and_said_to_be(noise_is_possible):
     theta = learn(inliers, space_about(start, free), start)[0].theta
     np.testing.assert_array_equal(theta[~free], start[~free])
     assert (theta[free] != start[free]).all()
+    nothing, _ = learn(inliers, space_about(start, np.zeros(6, dtype=bool)), start)
+    assert (nothing.status, nothing.n_evaluations) == ('converged', 0)
+    np.testing.assert_array_equal(nothing.theta, start)
 
 
 def test_priors_hold_theta_as_tight_as_they_are():

@@ -281,6 +281,7 @@ def test_frames_are_labelled_as_by_the_loops(backend, model, objective):
     np.testing.assert_allclose(found.ground_z, expected.ground_z, atol=1e-5)
     np.testing.assert_allclose(found.theta, expected.theta, atol=1e-5)
     assert found.fit.n_evaluations == expected.fit.n_evaluations > 0
+    assert found.fit.objective == pytest.approx(expected.fit.objective, rel=1e-6)
 
 
 def test_times_come_from_the_clock_given_and_the_fit_report_counts(scan):
