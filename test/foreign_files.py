@@ -465,6 +465,8 @@ CASES |= {
     'other_qos': (replaced('profiles: ""', 'profiles: "- history: 1\\n  depth: 5"'), THREE),
     'null_compression': (replaced('compression_mode: ""', 'compression_mode:'), THREE),
     'folder_in_its_paths': (replaced('    - drive.db3', '    - old/drive.db3'), THREE),
+    'windows_paths': (replaced('    - drive.db3', r'    - C:\logs\drive.db3'), THREE),
+    'null_count': (replaced('message_count: 3\n  compr', 'message_count:\n  compr'), THREE),
     'json_topic': (
         folder(
             lambda text: text.replace(CLOUDS, CLOUDS + TOPIC.format('/a', 'A', 'json', '', 0)),
@@ -481,6 +483,9 @@ CASES |= {
     'null': (folder(lambda _: 'rosbag2_bagfile_information:\n'), NAMED),
     'null_topics': (replaced(CLOUDS, ''), THREE),
     'null_files': (replaced('    - drive.db3\n', ''), NAMED),
+    'paths_as_text': (
+        replaced('relative_file_paths:\n    - drive.db3', 'relative_file_paths: drive.db3'), NAMED
+    ),
     'missing_file': (replaced('    - drive.db3', '    - no.db3'), r'metadata\.yaml: no\.db3: '),
     'other_plugin': (replaced('- drive.db3', '- metadata.yaml'), r'accepted are \.mcap and \.db3'),
 }  # fmt: skip

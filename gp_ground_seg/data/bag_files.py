@@ -82,9 +82,14 @@ def list_files(path: Path) -> tuple[list[Path], dict[str, int], bool]:
     counts: Counter[str] = Counter()
     try:
         said = yaml.safe_load(metadata.read_bytes())['rosbag2_bagfile_information']
-        files = [path / PurePath(name).name for name in said['relative_file_paths']]
+        names = said['relative_file_paths']
+        if not names or isinstance(names, str):
+            raise ValueError
+        # Some recorders write whole paths, under Windows with backslashes.
+        files = [path / PurePath(name.replace('\\', '/')).name for name in names]
         for topic in said.get('topics_with_message_count') or ():
-            counts[topic['topic_metadata']['name']] += int(topic['message_count'])
+            if topic['message_count'] is not None:
+                counts[topic['topic_metadata']['name']] += int(topic['message_count'])
     except (yaml.YAMLError, LookupError, TypeError, ValueError, AttributeError) as error:
         problem = 'cut off, or not as rosbag2 writes it' if metadata.stat().st_size else 'empty'
         raise DataError(f'{metadata}: {problem}; {again}') from error
@@ -126,9 +131,11 @@ def check_sqlite_path(path: Path) -> None:
 
 
 def check_sqlite_file(path: Path) -> None:
-    """Raise `DataError` where part of a sqlite file is cut off, or still in a journal."""
+    """Raise an error where a sqlite file is empty, cut off, or in part still in a journal."""
     with path.open('rb') as file:
         header = file.read(100)
+    if not header:
+        raise ValueError('empty')
     # The format is that of https://www.sqlite.org/fileformat.html.
     if len(header) == 100 and header[24:28] == header[92:96]:
         page_size, n_pages = struct.unpack_from('>16xH10xI', header)

@@ -13,7 +13,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,6 @@ import numpy.typing as npt
 from gp_ground_seg.core.errors import DataError, GroundSegError, PointCloudError, in_one_line
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.pipeline.points import finite_points, objection_to_ranges
-from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.clouds import (
     Cloud,
     Columns,
@@ -37,6 +36,9 @@ from gp_ground_seg.data.clouds import (
 from gp_ground_seg.data.files import MAX_SCAN_BYTES, read_bytes
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
+
+if TYPE_CHECKING:
+    from gp_ground_seg.core.result import Segmentation
 
 NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
 KITTI_COLUMNS = 4
