@@ -211,6 +211,7 @@ def test_a_warning_is_an_error_in_tests_and_not_where_plugins_are_imported(tmp_p
     path = os.pathsep.join(map(str, [tmp_path, REPOSITORY / 'test', *sys.path]))
     done = subprocess.run(
         [sys.executable, '-m', 'pytest', *words], capture_output=True, text=True,
-        env={**os.environ, 'PYTHONPATH': path, 'NUMBA_DISABLE_JIT': '1'},
+        # The options that colcon passes so name modules: of this one, for ever.
+        env={**os.environ, 'PYTHONPATH': path, 'NUMBA_DISABLE_JIT': '1', 'PYTEST_ADDOPTS': ''},
     )  # fmt: skip
     assert done.returncode == 1 and 'DeprecationWarning: late' in done.stdout, done.stderr
