@@ -19,7 +19,9 @@ from gp_ground_seg.lab.simulation import Scene
 from gp_ground_seg.lab.simulation import terrain as landforms
 
 
-@pytest.mark.parametrize('scene', ['urban', 'car_park'])
+@pytest.mark.parametrize(
+    'scene', [pytest.param('flat', marks=pytest.mark.slow), 'urban', 'car_park']
+)
 @pytest.mark.parametrize(
     ('length', 'width', 'ahead', 'below'),
     [(3.0, 3.0, 0.0, 0.3), (3.0, 2.2, -1.0, 0.5), (2.4, 1.0, 2.0, 1.0), (8.0, 2.4, -6.0, 1.5)],
@@ -41,8 +43,9 @@ def test_the_own_vehicle_is_not_the_ground(scene, length, width, ahead, below):
 
 @pytest.mark.parametrize('sensor', [SMALL_HDL, SMALL_OS1], ids=lambda s: s.name)
 def test_mirror_images_on_a_wet_road_are_not_the_ground(sensor):
-    pose = pose_of(scan_of('wet_road', sensor, 1.75, seed=1).points)
-    assert pose.height == pytest.approx(1.75, abs=0.15)
+    for seed in range(3):
+        pose = pose_of(scan_of('wet_road', sensor, 1.75, seed=seed).points)
+        assert pose.height == pytest.approx(1.75, abs=0.15)
 
 
 LEVELS = {
@@ -91,7 +94,7 @@ def test_a_slope_nearby_is_not_the_ground_of_the_robot(sensor, scene):
 
 def test_what_is_not_levelled_has_the_height_of_a_level_plane():
     """Hills of which no plane has enough to tell the tilt."""
-    found = [pose_of(scan_of('hills', SMALL_OS1, 1.75, seed=seed).points) for seed in range(3)]
+    found = [pose_of(scan_of('hills', SMALL_OS1, 1.75, seed=seed).points) for seed in range(6)]
     untold = [pose.measured.plane for pose in found if not pose.measured.tells_tilt]
     assert untold
     for plane in untold:

@@ -3,7 +3,7 @@ import pytest
 from conftest import simulated
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.errors import ConfigError, PointCloudError
 from gp_ground_seg.core.pipeline import points
 
 
@@ -127,6 +127,15 @@ def test_the_crop_box_may_be_in_another_frame():
     config = Config().replace(**{'runtime.backend': 'numpy', **VALUES})
     found = GroundSegmenter(config).segment(moved, (0.2, -0.3), box_frame=(turn, move))
     np.testing.assert_array_equal(found.label == Label.UNKNOWN, is_body)
+
+
+@pytest.mark.parametrize(
+    'frame', [1.0, (np.eye(3),), (np.eye(2), np.zeros(3)), (np.eye(3), [0.0, 0.0, np.nan])]
+)
+def test_a_frame_of_the_box_that_is_none_is_refused(frame):
+    config = Config().replace(**{'runtime.backend': 'numpy', **VALUES})
+    with pytest.raises(ConfigError, match=r'^box_frame = .*: must be a rotation'):
+        GroundSegmenter(config).segment(scan_with_own_body()[0], box_frame=frame)
 
 
 def test_without_a_point_in_the_box_nothing_is_copied():

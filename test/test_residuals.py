@@ -157,7 +157,10 @@ def test_height_and_ground_z_are_of_one_surface(tilt):
     assert abs(np.mean(corrected)) < 0.003
 
 
-@pytest.mark.parametrize('sensor', ['hdl-64e', 'vlp-16', 'os1-128', 'mid-360'])
+@pytest.mark.parametrize(
+    'sensor',
+    ['hdl-64e', pytest.param('hdl-32e', marks=pytest.mark.slow), 'vlp-16', 'os1-128', 'mid-360'],
+)
 def test_the_defaults_fit_every_sensor_and_errors_are_as_large_as_said(sensor):
     """Every scene once, by exact labels and heights; docs/accuracy.md has more seeds."""
     segmenter = GroundSegmenter()

@@ -132,7 +132,7 @@ class GroundSegmenter:
             If the array has another shape or type, or z clearly does not point up.
         ConfigError
             If `tilt` or `origin` has another number of values, or one that is not finite, or
-            `fallback` is no `SensorPose`.
+            `fallback` is no `SensorPose`, or `box_frame` no rotation and translation.
         """
         with self._exclusive():
             timer, sensor = StageTimer(self._clock), self._config.sensor
@@ -147,7 +147,7 @@ class GroundSegmenter:
             xyz = take_points(points, (sensor.origin_x, sensor.origin_y, sensor.origin_z))
             box = self._config.input.crop_box
             if box != NO_BOX:
-                xyz = without_box(xyz, box, box_frame)
+                xyz = without_box(xyz, box, _checked_frame(box_frame))
             result = self._segment(xyz, sensor, timer, fallback)
             self._warn(result.warnings)
             return result
@@ -320,6 +320,21 @@ def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[flo
         if are_numbers and len(given) == count and all(map(math.isfinite, given)):
             return tuple(map(float, given))
     raise ConfigError(f'{name} = {_shortened(values)}: must be {count} finite numbers')
+
+
+def _checked_frame(
+    frame: tuple[FloatArray, FloatArray] | None,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return the `box_frame` of `segment`; raise a ConfigError if it is none."""
+    if frame is None:
+        return None
+    with contextlib.suppress(TypeError, ValueError):
+        turn, move = (np.asarray(part, dtype=np.float64) for part in frame)
+        if (turn.shape, move.shape) == ((3, 3), (3,)) and np.isfinite([*turn, move]).all():
+            return turn, move
+    raise ConfigError(
+        f'box_frame = {_shortened(frame)}: must be a rotation (3, 3) and a translation (3,)'
+    )
 
 
 def _shortened(value: object) -> str:

@@ -100,9 +100,8 @@ class CloudFrames(NamedTuple):
     tilt: tuple[float, float] | None = None  # roll and pitch of the sensor [rad]
     origin: tuple[float, float, float] | None = None  # place of the sensor in it [m]
     base: Placement | None = None  # where ``frame.base`` is
-    output: Placement | None = (
-        None  # where ``output.frame`` is; None also if it is that of the cloud
-    )
+    # where ``output.frame`` is; None also if it is that of the cloud
+    output: Placement | None = None
 
 
 class ImuListener:

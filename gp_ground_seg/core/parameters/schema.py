@@ -48,9 +48,8 @@ class ParameterSpec:
     """Declaration of one parameter."""
 
     name: str  # dotted, ``group.field``
-    type: (
-        type  # bool, int, float or str; tuple of a box; that of the number where it may be `AUTO`
-    )
+    # bool, int, float or str; tuple of a box; that of the number where it may be `AUTO`
+    type: type
     default: Any  # a `ParameterValue`
     description: str
     unit: str  # SI; empty for a pure number
