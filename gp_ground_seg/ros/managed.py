@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
+from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 
@@ -21,6 +22,7 @@ from gp_ground_seg.ros.start_stop import StopRequest
 PERIOD = 1.0  # from one heartbeat to the next [s]
 TIMEOUT = 4.0  # without one until the node is taken for dead [s]: the manager's own default
 DEPTH = 5
+LAST_WORDS = Duration(seconds=0.5)  # longest wait until the end of a bond is delivered
 NO_BOND = (
     'package bond is not installed (apt install ros-jazzy-bond): set bond_timeout: 0.0 on a '
     'lifecycle manager of this node'
@@ -145,6 +147,8 @@ class Heartbeat:
     def stop(self) -> None:
         """Say that the bond ends on purpose."""
         self._beat(False)
+        # A publisher that is destroyed takes with it what is not yet delivered.
+        self._publisher.wait_for_all_acked(LAST_WORDS)
         self._node.destroy_timer(self._timer)
         self._node.destroy_publisher(self._publisher)
 
