@@ -12,14 +12,18 @@ import io
 import json
 import os
 import resource
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 from bag_samples import scan, write_ros2_bag
 from cli_runner import run
+from conftest import REPOSITORY
 from evaluation_samples import write_streets
 
 from gp_ground_seg.cli import tune
+from gp_ground_seg.core import jit
 from gp_ground_seg.data.bags import BagReader
 
 FULL, BROKEN, PARTLY = errno.ENOSPC, errno.EIO, None
@@ -269,3 +273,67 @@ def test_a_disk_that_is_full_at_any_page_of_a_sqlite_bag(tmp_path, capsys):
         assert code == 2 and f'{folder}/out.db3: cannot be written: ' in said, size
         assert [path.name for path in folder.iterdir()] == ['mine']
         assert_begun_again(line, folder, expected, size)
+
+
+DOUBLE = """
+from gp_ground_seg.core import jit
+
+@jit.jit(entry=True)
+def double(x):
+    return 2.0 * x
+"""
+COMPILE = """
+import json, os, sys
+import numba
+from test_write_faults import Disk, double_in
+
+for line in sys.stdin:
+    read, write = os.pipe()
+    if os.fork() == 0:
+        os.write(write, json.dumps(double_in(*json.loads(line))).encode())
+        os._exit(0)
+    os.close(write)
+    with open(read) as said:
+        print(said.read(), flush=True)
+"""
+
+
+def double_in(folder, *fault):
+    """Use compiled code that is kept in `folder`; what a process finds that has just begun."""
+    os.environ['NUMBA_CACHE_DIR'] = folder
+    jit.code_folder.cache_clear()
+    with Disk(folder, *fault).at_work() as disk:
+        from double import double
+
+        result = double(21.0)
+        jit.keep_code()
+    return result, sum(double.stats.cache_hits.values()), disk.calls
+
+
+@pytest.mark.slow
+def test_each_call_that_keeps_compiled_code_fails_in_turn(tmp_path):
+    """The result is there, and the next process but one has its code from disk."""
+    if not jit.HAVE_NUMBA:
+        pytest.skip('nothing is compiled')
+    (tmp_path / 'double.py').write_text(DOUBLE)
+    paths = [str(REPOSITORY), str(REPOSITORY / 'test'), str(tmp_path)]
+    changed = {'PYTHONPATH': os.pathsep.join(paths), 'NUMBA_DISABLE_JIT': '0'}
+    command, pipes = [sys.executable, '-c', COMPILE], {'stdin': subprocess.PIPE}
+    pipes |= {'stdout': subprocess.PIPE, 'stderr': subprocess.DEVNULL}
+    with subprocess.Popen(command, env=os.environ | changed, text=True, **pipes) as process:
+
+        def use(folder, *fault):
+            process.stdin.write(json.dumps([str(folder), *fault]) + '\n')
+            process.stdin.flush()
+            return json.loads(process.stdout.readline())
+
+        result, _, calls = use(tmp_path / 'whole')
+        assert result == 42.0 and {'mkdir', 'open', 'write', 'replace'} <= {c for c, _ in calls}
+        for k, (call, place) in enumerate(calls):
+            for fault in FAULTS.get(call, (FULL,)):
+                folder, where = tmp_path / f'{k}{fault}', f'{call} {place}, {fault}'
+                assert use(folder, k, fault)[0] == 42.0, where
+                assert use(folder)[0] == 42.0, where
+                assert use(folder)[:2] == [42.0, 1], where
+                left = [path.name for path in folder.rglob('*')]
+                assert not [name for name in left if 'tmp' in name], (where, left)
