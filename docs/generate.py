@@ -30,8 +30,8 @@ ALL_PARAMETERS = """
 REMOVED_HEAD = """
 ## Removed
 
-A file or a command that has one of these ends with its line. The node and the launch file leave it
-out, and warn. Topics begin with `~/`: a subscriber of one gets no message.
+A command, a parameter file, the node or the launch file that is given a removed name says what to
+use instead; CHANGELOG.rst has all of them. Nothing can say it of these:
 
 | Removed | Instead |
 | --- | --- |
@@ -108,6 +108,11 @@ def to_scores_table() -> str:
     return ''.join(f'| {" | ".join(row)} |\n' for row in rows)
 
 
+def is_silent(name: str) -> bool:
+    """Whether nothing of ours is asked for a removed name: a topic, a launch file."""
+    return name.startswith('~/') or (name.endswith('.launch.py') and ' ' not in name)
+
+
 def generated_files(readme: str) -> dict[str, str]:
     """Text of every generated file of a checkout, by its path from the root.
 
@@ -119,10 +124,7 @@ def generated_files(readme: str) -> dict[str, str]:
         for preset in PRESETS.values()
     }
     files[README] = with_table(readme, SCORES, to_scores_table())
-    names: dict[str, list[str]] = {}
-    for name, instead in REMOVED.items():
-        names.setdefault(instead, []).append(f'`{name}`')
-    removed = ''.join(f'| {", ".join(own)} | {instead} |\n' for instead, own in names.items())
+    removed = ''.join(f'| `{name}` | {REMOVED[name]} |\n' for name in REMOVED if is_silent(name))
     page = PAGE_HEAD + to_markdown_table() + ALL_PARAMETERS + REMOVED_HEAD + removed
     files['docs/parameters.md'] = page
     return files

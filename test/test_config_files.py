@@ -108,9 +108,11 @@ def test_the_page_of_parameters_has_its_table_all_parameters_and_what_is_gone():
     assert table.endswith(generate.to_markdown_table()) and listing == ''
     (path,) = re.findall('^```{literalinclude} (.*)$', page, re.MULTILINE)
     assert (REPOSITORY / 'docs' / path).samefile(REPOSITORY / 'config' / 'default.yaml')
-    shown = (line[2:-2].split(' | ') for line in removed.splitlines())
-    found = [(name, use) for names, use in shown for name in names.split(', ')]
-    assert sorted(found) == sorted((f'`{name}`', use) for name, use in REMOVED.items())
+    shown = dict(line[2:-2].split(' | ') for line in removed.splitlines())
+    # What commands, node and launch file print is tested where they are.
+    silent = [name for name in REMOVED if re.fullmatch(r'~/\S+|\S+\.launch\.py', name)]
+    assert '~/markers' in silent
+    assert shown == {f'`{name}`': REMOVED[name] for name in silent}
 
 
 @pytest.mark.parametrize('marks', ['', 'b', 'e', 'eb', 'bbe', 'bee'])
