@@ -32,6 +32,7 @@ napoleon_google_docstring = False
 napoleon_use_ivar = True
 
 HELP = re.compile(r'^<!-- help: (.*) -->$', re.MULTILINE)
+REMOVED_MARK = '<!-- removed -->\n'
 
 
 def help_of(words):
@@ -45,11 +46,24 @@ def help_of(words):
     return printed.getvalue()
 
 
-def insert_help(_app, _page, source):
-    """Put the help of commands where a page has a comment for it: docs/cli.md."""
+def removed_names():
+    """Return a table of the names that are gone, those with the same advice in one row."""
+    from gp_ground_seg.core.parameters.removed import REMOVED
+
+    names = {}
+    for name, instead in REMOVED.items():
+        names.setdefault(instead, []).append(f'`{name}`')
+    rows = (f'| {", ".join(own)} | {instead} |\n' for instead, own in names.items())
+    return '| Removed | Instead |\n| --- | --- |\n' + ''.join(rows)
+
+
+def insert_code(_app, _page, source):
+    """Put what the code says where a page has a comment for it: docs/cli.md, parameters.md."""
     source[0] = HELP.sub(lambda found: f'```text\n{help_of(found[1].split())}```', source[0])
+    if REMOVED_MARK in source[0]:
+        source[0] = source[0].replace(REMOVED_MARK, removed_names())
 
 
 def setup(app):
     """Register the hook, as Sphinx asks for."""
-    app.connect('source-read', insert_help)
+    app.connect('source-read', insert_code)

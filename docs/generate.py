@@ -5,7 +5,6 @@ from pathlib import Path
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import PRESETS, parameter_specs
 from gp_ground_seg.core.parameters.export import accepted_values, to_yaml, yaml_scalar
-from gp_ground_seg.core.parameters.removed import REMOVED
 
 ROOT = Path(__file__).resolve().parent.parent
 README = 'README.md'
@@ -27,14 +26,14 @@ ALL_PARAMETERS = """
 :language: yaml
 ```
 """
-REMOVED_HEAD = """
+REMOVED_NAMES = """
 ## Removed
 
 A command, a parameter file, the node or the launch file that is given a removed name says what to
-use instead; CHANGELOG.rst has all of them. Nothing can say it of these:
+use instead; a subscriber of a removed topic gets no message. The HTML version of this page has the
+table of all names, of [removed.py](../gp_ground_seg/core/parameters/removed.py).
 
-| Removed | Instead |
-| --- | --- |
+<!-- removed -->
 """
 
 
@@ -108,11 +107,6 @@ def to_scores_table() -> str:
     return ''.join(f'| {" | ".join(row)} |\n' for row in rows)
 
 
-def is_silent(name: str) -> bool:
-    """Whether nothing of ours is asked for a removed name: a topic, a launch file."""
-    return name.startswith('~/') or (name.endswith('.launch.py') and ' ' not in name)
-
-
 def generated_files(readme: str) -> dict[str, str]:
     """Text of every generated file of a checkout, by its path from the root.
 
@@ -124,8 +118,7 @@ def generated_files(readme: str) -> dict[str, str]:
         for preset in PRESETS.values()
     }
     files[README] = with_table(readme, SCORES, to_scores_table())
-    removed = ''.join(f'| `{name}` | {REMOVED[name]} |\n' for name in REMOVED if is_silent(name))
-    page = PAGE_HEAD + to_markdown_table() + ALL_PARAMETERS + REMOVED_HEAD + removed
+    page = PAGE_HEAD + to_markdown_table() + ALL_PARAMETERS + REMOVED_NAMES
     files['docs/parameters.md'] = page
     return files
 
