@@ -138,6 +138,16 @@ def test_scans_and_parameters_are_those_of_the_options(
         (['ablation', 'ROOT', '--scenes', 'flat'], '--scenes: is for --simulated only'),
         (['ablation', 'ROOT', '--sensors', 'vlp-16'], '--sensors: is for --simulated only'),
         (['scenes', '--preset', 'papr'], 'did you mean paper?'),
+        (['scenes', '--sensors', 'vlp-32'], 'must be some of hdl-64e'),
+        (['scenes', '--scenes', 'flat,flat'], 'each once'),
+        (['ablation', '--seeds', '0'], 'at least 1'),
+        (['table1'], 'ROOT'),
+        (['table1', 'ROOT', '--sequences', '08'], 'no frame 000000 in sequence 00'),
+        (['table1', 'ROOT', '--set', 'grid.n_segments=4'], 'segment 4: must be in [0, 3]'),
+        (['table1', 'ROOT', '--set', 'length_scale.model=constant'], 'leave it out'),
+        (['table1', 'ROOT', '--set', 'learning.mode=fixed'], 'leave it out'),
+        ([], 'NAME'),
+        (['moon'], 'moon'),
         *(([name, '--json', 'MINE', *(['ROOT'] if name not in ('scenes', 'objects') else [])],
            '--force') for name in EXPERIMENTS),
     ],
@@ -152,23 +162,6 @@ def test_errors_are_said_before_any_frame_is_read(
     assert run('experiment', *(named.get(word, word) for word in words)) == 2
     assert message in error_line(capsys)
     assert target.read_text() == 'mine'
-
-
-@pytest.mark.parametrize(
-    ('words', 'message'),
-    [
-        (['ablation', '--seeds', '0'], 'at least 1'),
-        (['ablation', '--frame-step', 'x'], 'at least 1'),
-        (['scenes', '--sensors', 'vlp-32'], 'must be some of hdl-64e'),
-        (['scenes', '--scenes', 'flat,flat'], 'each once'),
-        (['table1'], 'ROOT'),
-        ([], 'NAME'),
-        (['moon'], 'moon'),
-    ],
-)
-def test_usage_errors(words, message, capsys):
-    assert run('experiment', *words) == 2
-    assert message in error_line(capsys)
 
 
 def test_commands_of_the_docs_are_accepted():
@@ -266,20 +259,6 @@ def test_theta_is_of_the_whole_frame_and_learned(measured):
     assert first == second
     given = np.square([0.9, 2.0, 0.25])
     assert (np.abs(first[2:] / given - 1.0) > 1e-4).all()
-
-
-@pytest.mark.parametrize(
-    ('words', 'message'),
-    [
-        ([], 'no frame 000001 in sequence 00'),
-        (['--set', 'grid.n_segments=4'], 'segment 4: must be in [0, 3]'),
-        (['--set', 'length_scale.model=constant'], 'leave it out'),
-        (['--set', 'learning.mode=fixed'], 'leave it out'),
-    ],
-)
-def test_errors_of_the_table_are_said(rubble, words, message, capsys):
-    assert run('experiment', 'table1', rubble, *words) == 2
-    assert message in error_line(capsys)
 
 
 def test_default_segments_of_real_frames(kitti, monkeypatch):
