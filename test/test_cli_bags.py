@@ -138,9 +138,6 @@ def test_which_topics(tmp_path, capsys):
     with listening('/front', '/rear') as listener:
         assert play(bag, '--quiet') == 2
         assert 'choose one with --topic: /front, /rear' in capsys.readouterr().err
-        assert play(bag, '--topic', '/note') == 2
-        assert 'is of type std_msgs/msg/String' in capsys.readouterr().err
-
         assert play(bag, '--topic', '/rear', '--quiet') == 0
         wait_for(lambda: len(listener.clouds['/rear']) == 2, 'last cloud')
         assert listener.clouds['/front'] == []
@@ -173,11 +170,9 @@ def test_bag_of_ros_1_on_another_topic_for_a_best_effort_subscriber(tmp_path, ca
 
 
 def test_nobody_listens(tmp_path, capsys):
-    bag = drive(tmp_path, 3)
     with isolated_context():
-        assert play(bag, '--no-wait', '--quiet', '--rate', 10) == 0
-    numbers = summary(capsys)
-    assert numbers[0] == 3
+        assert play(drive(tmp_path, 1), '--no-wait', '--quiet') == 0
+    assert capsys.readouterr().out == '1 cloud sent in 0.0 s\n'
 
 
 def test_waits_and_says_so(tmp_path, capsys, monkeypatch):
@@ -266,35 +261,29 @@ rclpy.spin(node)
 def test_subscriber_that_is_killed(tmp_path, capsys, monkeypatch):
     """It cannot say goodbye: the middleware believes in it, but no longer hears of it."""
     monkeypatch.setattr(playback, 'DELIVERY_TIMEOUT', 0.5)
+    send, sent = playback.Player._send, []
+
+    def note(player, topic, raw):
+        sent.append(time.monotonic())
+        send(player, topic, raw)
+
+    monkeypatch.setattr(playback.Player, '_send', note)
     bag = drive(tmp_path, 20)
     with program(code=('-c', SUBSCRIBER)) as subscriber, isolated_context():
         assert play(bag) == 1
+        assert time.monotonic() - sent[-1] > 0.5
         assert subscriber.wait(PATIENCE) == -signal.SIGKILL
     said = capsys.readouterr().err.splitlines()[-1]
     assert said.endswith('not every reliable subscriber has acknowledged all clouds')
 
 
-def test_without_ros(tmp_path, capsys, monkeypatch):
-    write_ros2_bag(tmp_path / 'drive.mcap', 1)
-    for name in [name for name in sys.modules if name.startswith('gp_ground_seg.ros.playback')]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.delattr('gp_ground_seg.ros.playback')
-    monkeypatch.setitem(sys.modules, 'rclpy.duration', None)
-    assert play(tmp_path / 'drive.mcap') == 2
-    line = error_line(capsys)
-    assert line.startswith('play needs ROS 2, which cannot be imported')
-    assert "pip install 'ros-jazzy-rclpy[fastrtps]' " in line
-
-
-@pytest.mark.parametrize('rate', ['0', '-1', 'nan'])
-def test_refused_options(rate, tmp_path, capsys):
-    assert play(tmp_path / 'drive.mcap', '--rate', rate) == 2
-    assert error_line(capsys).startswith('play: --rate: ')
-
-
-def test_no_bag(tmp_path, capsys):
-    assert play(tmp_path / 'none.mcap') == 2
-    assert error_line(capsys) == f'{tmp_path / "none.mcap"}: no such file or folder'
-    write_ros2_bag(tmp_path / 'drive.mcap', 1)
-    assert play(tmp_path / 'drive.mcap', '--quiet', '--ros-args', '-r', 'nonsense') == 2
-    assert error_line(capsys)
+def test_refused(tmp_path, capsys):
+    bag = drive(tmp_path, 1)
+    for words, said in (
+        ([bag, '--rate', 0], 'play: --rate: '),
+        ([bag, '--rate', 'nan'], 'play: --rate: '),
+        ([tmp_path / 'none.mcap'], f'{tmp_path / "none.mcap"}: no such file or folder'),
+        ([bag, '--quiet', '--ros-args', '-r', 'nonsense'], ''),
+    ):
+        assert play(*words) == 2
+        assert error_line(capsys).startswith(said)

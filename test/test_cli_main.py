@@ -77,6 +77,7 @@ def test_a_misspelt_command_is_one_line(word, hint, capsys):
         ('segment', 'segment: the following arguments are required: INPUT; {help segment}'),
         ('segment A --workers', 'segment: --workers: expected one argument; {help segment}'),
         ('segment A --workers x', "segment: --workers: 'x': must be a whole number, at least 1"),
+        ('demo --frames 0', "demo: --frames: '0': must be a whole number, at least 1"),
         ('segment A --format csv', "segment: --format: 'csv': must be one of label, pcd, ply, "
          'npy, npz, mcap, sqlite3'),
         ('segment A --preset papr',
