@@ -351,6 +351,22 @@ class Bench(Link):
         has_to_load = choose_backend(self.node.config.runtime.backend) == 'numba'
         wait_for(lambda: self.node._is_compiled or not has_to_load, 'compiled backend')
 
+    def listen(self, topic, message_type=PointCloud2):
+        """A `Collector` of an optional output, once the node knows of it and of no other."""
+        publisher = next(p for o, p in self.node._outputs._publishers if o.topic == topic)
+        wait_for(lambda: publisher.get_subscription_count() == 0, f'end of ears of {topic}')
+        collector = Collector(self.probe, message_type, topic.replace('~', NODE_NAME))
+        wait_for(lambda: publisher.get_subscription_count() == 1, f'ear of {topic}')
+        return collector
+
+    @contextlib.contextmanager
+    def changed(self, values):
+        """Other values of parameters within the block."""
+        before = {name: self.node.config[name] for name in values}
+        assert all(result.successful for result in self.load(values))
+        yield
+        assert all(result.successful for result in self.load(before))
+
     def in_executor(self, function, *arguments):
         """Result of a call made between two waits, where entities may safely go."""
         task = self.node.executor.create_task(function, *arguments)

@@ -20,12 +20,11 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.time import Time
 from ros_helpers import bench, street, to_message, wait_for, xyz_of
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import Imu, LaserScan, PointCloud2
+from sensor_msgs.msg import Imu, LaserScan
 from test_sensor_pose import ROOM
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.core.pipeline.points import angles_of, rotation
 from gp_ground_seg.lab.simulation import VLP_16, simulate_scan
 from gp_ground_seg.ros import transforms
@@ -99,9 +98,7 @@ def test_given_tilt_levels_and_leaves_the_points_as_they_are():
     message = to_message(points, stamp=(3, 4), frame='tilted_lidar')
     tilt = {'sensor.roll': TILT[0], 'sensor.pitch': TILT[1]}
     with bench(*ros.given({**VALUES, **tilt})) as b:
-        model = ros.Collector(b.probe, PointCloud2, 'ground_segmentation_node/ground_model')
-        publisher = next(p for o, p in b.node._outputs._publishers if 'model' in o.topic)
-        wait_for(lambda: publisher.get_subscription_count() == 1, 'ear of the model')
+        model = b.listen('~/ground_model')
         parts = b.segment(message)
         cloud = model.wait(1)[0]
         if not HAS_TF2:
@@ -215,10 +212,7 @@ def test_outputs_in_a_frame_of_tf_at_the_stamp(monkeypatch):
     values = {**VALUES, 'frame.level': 'tf', 'output.frame': 'odom', 'diagnostics.period': 0.1}
     values[f'qos_overrides.{ros.NAMESPACE}/points.subscription.depth'] = 5
     with bench(*ros.given(values)) as b:
-        names = {'scan': LaserScan, 'occupancy': OccupancyGrid}
-        maps = [ros.Collector(b.probe, kind, f'{NODE_NAME}/{n}') for n, kind in names.items()]
-        listens = b.node._outputs.n_subscribers
-        wait_for(lambda: list(listens().values()).count(1) >= 4, 'ears of scan and occupancy')
+        maps = b.listen('~/scan', LaserScan), b.listen('~/occupancy', OccupancyGrid)
         # The newest so far would be wrong, and clouds keep their order.
         frames = [('base_link', 'tilted_lidar'), ('odom', 'tilted_lidar')]
         monkeypatch.setattr(

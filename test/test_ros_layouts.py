@@ -68,11 +68,7 @@ def cloud_of(code, shape, padding, share):
 @pytest.fixture(scope='module')
 def tested():
     with ros.bench(*ros.given(CHANGES)) as b:
-        labelled = ros.Collector(b.probe, PointCloud2, 'ground_segmentation_node/labeled')
-        publisher = next(p for o, p in b.node._outputs._publishers if o.topic == '~/labeled')
-        ros.wait_for(lambda: publisher.get_subscription_count() == 1, 'ear of the labelled cloud')
-        segmenter = GroundSegmenter(Config().replace(**CHANGES))
-        yield b, labelled, segmenter
+        yield b, b.listen('~/labeled'), GroundSegmenter(Config().replace(**CHANGES))
 
 
 @pytest.mark.parametrize('case', CASES)
