@@ -153,14 +153,6 @@ def test_input_reports_what_it_saw():
     assert jumped.items() <= statistics.report(2.3, FACTS, LIMITS).values.items()
 
 
-@given(st.floats(-1e10, 1e10), st.floats(0.0, 1e10), st.booleans())
-def test_a_stamp_of_any_age_is_no_fault(stamp, ros_time, is_simulated):
-    statistics = InputTask(0.0)
-    arrive(statistics, 0.1, stamp)
-    facts = InputFacts('/points', '', 1, ros_time, is_simulated)
-    assert statistics.report(0.2, facts, LIMITS).level == Level.OK
-
-
 @given(st.lists(st.booleans(), min_size=1, max_size=20))
 def test_a_refusal_is_an_error(are_refused):
     statistics = InputTask(0.0)
@@ -252,21 +244,6 @@ def test_model_reports_where_the_sensor_is(height):
     assert abs(float(values['Estimated pitch (rad)'])) < 0.1
     assert status.level == (Level.WARN if height == 3.5 else Level.OK)
     assert ('sensor.height' in status.message) == (height == 3.5)
-
-
-def test_model_warns_of_a_height_that_is_assumed_or_of_an_earlier_cloud():
-    points, segmenter, statistics = hilly_scan(20_000), GroundSegmenter(), ModelTask()
-    part = points[np.abs(np.arctan2(points[:, 1], points[:, 0])) < 0.1]
-    whole, alone = segmenter.segment(points), segmenter.segment(part)
-    statistics.segmented(alone)
-    status = statistics.report()
-    assert (status.level, status.message) == (Level.WARN, alone.pose.warnings[0])
-    statistics.segmented(segmenter.segment(part, fallback=whole.pose))
-    status = statistics.report()
-    assert status.level == Level.WARN
-    assert f'{whole.pose.height:.2f} m of an earlier one is kept' in status.message
-    statistics.segmented(whole)
-    assert statistics.report().level == Level.OK
 
 
 @pytest.mark.parametrize('points', [np.zeros((0, 3)), np.full((9, 3), np.nan)])

@@ -16,7 +16,7 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter, parameter_value_to_python
 from ros_helpers import bench, street, to_message
 
-from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
+from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.config import PRESETS, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.export import file_problems
@@ -105,17 +105,10 @@ def test_a_change_takes_effect_with_the_next_cloud(b, tmp_path):
         assert n_ground(points, Config()) != n_ground(points, narrow)
 
 
-HEIGHT = 'must be auto or a number in [-5, 20] m'
-
-
 @pytest.mark.parametrize(
     ('name', 'value', 'reason'),
     [
-        ('sensor.height', 30.0, f'sensor.height = 30.0: {HEIGHT}'),
-        ('sensor.height', float('nan'), f'sensor.height = nan: {HEIGHT}'),
-        ('sensor.height', 30, f'sensor.height = 30: {HEIGHT}'),
-        ('sensor.height', '2', f"sensor.height = '2': {HEIGHT}"),
-        ('sensor.height', [1.0], 'sensor.height = '),
+        ('sensor.height', 30.0, 'sensor.height = 30.0: must be auto or a number in [-5, 20] m'),
         ('grid.n_segments', 3, 'grid.n_segments = 3: must be an integer in [4, 2048]'),
         ('grid.n_segments', 90.0, 'grid.n_segments = 90.0: must be an integer in [4, 2048]'),
         ('runtime.backend', 'gpu', "runtime.backend = 'gpu': must be one of auto, numba, numpy"),
@@ -139,7 +132,19 @@ def test_a_number_or_auto_is_taken_and_nothing_else(b, name):
         (found,) = described(b, [name])
         assert found.type == TYPES[type(value)]
         assert found.floating_point_range[0].to_value == find_spec(name).maximum
-    wrong = ['Auto', 'automatic', '', '0.5', True, 99, 99.0, -99.0, float('inf'), [0.5], None]
+    wrong = [
+        'Auto',
+        'automatic',
+        '',
+        '0.5',
+        True,
+        99,
+        99.0,
+        float('nan'),
+        float('inf'),
+        [0.5],
+        None,
+    ]
     for value in wrong:
         result = b.set(name, value)
         assert not result.successful
@@ -174,17 +179,6 @@ def test_an_integer_is_taken_for_any_number(b, setter):
         (found,) = values_of(b, [name]).values()
         assert (type(found), found) == (float, value)
         assert b.node.config[name] == value
-
-
-def test_an_integer_in_a_file_is_taken_for_a_number(tmp_path):
-    path = tmp_path / 'parameters.yaml'
-    path.write_text(
-        '/**:\n  ros__parameters:\n    {label: {ground_tolerance: 1}, sensor.height: 2}\n'
-    )
-    with ros.started_node('--params-file', str(path)) as node:
-        changes = {'label.ground_tolerance': 1.0, 'sensor.height': 2.0}
-        assert node.config == Config().replace(**changes)
-        assert all(node.get_parameter(n).type_ == Parameter.Type.DOUBLE for n in changes)
 
 
 def test_a_fault_in_the_check_is_answered_and_the_node_lives(b, monkeypatch):
@@ -287,14 +281,6 @@ def test_node_starts_with_every_shipped_file(name):
     path = REPOSITORY / 'config' / f'{name}.yaml'
     with ros.started_node('--params-file', str(path), '-r', '__ns:=/any') as node:
         assert node.config == PRESETS[name].config
-
-
-def test_the_constructor_raises_what_is_not_accepted():
-    with (
-        pytest.raises(ConfigError, match=r'sensor\.height = 99'),
-        ros.started_node('-p', 'sensor.height:=99.0'),
-    ):
-        pass
 
 
 def test_unknown_names_are_reported_and_not_declared(tmp_path):

@@ -1,13 +1,10 @@
 """The node, drivers and players, each a process: what comes back, what diagnostics say."""
 
-import re
 import signal
 import sys
 import time
-from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
@@ -15,14 +12,10 @@ pytest.importorskip('rclpy', reason='ROS is not installed')
 import ros_helpers as ros
 from conftest import REPOSITORY
 from diagnostic_msgs.msg import DiagnosticStatus
-from nav_msgs.msg import OccupancyGrid
 from rcl_interfaces.msg import ParameterType
 from ros_helpers import NAMESPACE, street, to_message
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import LaserScan, PointCloud2
 
-from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.data.point_cloud2 import read_columns
 from gp_ground_seg.ros.input import NO_TIME
 
 # A busy machine must not look like a fault; everything else may.
@@ -79,46 +72,6 @@ def test_values_of_every_type_are_answered(setter):
             wanted = 'must be a number in' if number < 10 else f': {number} is not a valid'
             assert result.successful or wanted in result.reason
         link.segment(to_message(street(500)))
-
-
-@pytest.mark.usefixtures('node')
-def test_rays_without_a_return_are_in_no_output():
-    points = street(9000, n_invalid=100)
-    returns = np.isfinite(points['z'])
-    many = np.repeat(points[:1], 20_000)  # more than returns
-    many['x'], many['y'], many['z'] = 0.0, -0.0, 0.0
-    message = to_message(np.concatenate([many[:9000], points, many[9000:]]))
-    with ros.linked() as link:
-        plain = link.segment(to_message(points))
-        parts = link.segment(message)
-        assert [part.width for part in parts] == [part.width for part in plain]
-        assert sum(part.width for part in parts) == returns.sum()
-        status = link.wait_for_status('model', lambda v, _: v['Unknown fraction'] > '0.6')
-        assert ros.values_of(status)['Points without a return'] == '20100'
-        topics = {'scan': LaserScan, 'occupancy': OccupancyGrid, 'labeled': PointCloud2}
-        ears = {
-            topic: ros.Collector(link.probe, kind, f'{NODE_NAME}/{topic}')
-            for topic, kind in topics.items()
-        }
-        heard = lambda: all(ear.messages for ear in ears.values())  # noqa: E731
-        link.publish_until(message, heard, 'answers')
-        scan, grid, labelled = (ears[topic].messages[-1] for topic in topics)
-        assert np.nanmin(scan.ranges) > 2.0
-        side, half = grid.info.width, grid.info.width // 2
-        cells = np.array(grid.data).reshape(side, side)
-        assert not (cells[half - 5 : half + 5, half - 5 : half + 5] == 100).any()
-        assert (cells == 100).any()
-        label = read_columns(labelled, ['label'])['label'].reshape(-1)
-        assert (label == 0).sum() == 20_100 and not label[:9000].any()
-
-
-def test_the_log_says_that_the_node_works(node):
-    with ros.linked() as link:
-        link.segment(to_message(street(500)))
-    line = r'\[([\d.]+)\].*: \d+ clouds? segmented so far, .* Hz, .* ms, share of ground 0\.'
-    ros.wait_for(lambda: re.search(line, node.log), 'line')
-    times = [float(text) for text in re.findall(line, node.log)]
-    assert all(after - before > 59.9 for before, after in pairwise(times))
 
 
 def test_what_rclpy_raises_does_not_end_the_node(node):
@@ -186,11 +139,7 @@ def test_best_effort_driver_with_the_large_segment_profile(node, tmp_path):
 
 
 @pytest.mark.usefixtures('node')
-@pytest.mark.parametrize('sends', ['RELIABLE', 'BEST_EFFORT'])
-def test_a_best_effort_subscriber_is_served(sends):
-    with ros.linked(getattr(ros, sends), ros.BEST_EFFORT) as link:
-        link.publish_until(
-            to_message(street(500)),
-            lambda: link.ground.messages and link.obstacles.messages,
-            'clouds',
-        )
+def test_a_best_effort_subscriber_is_served():
+    with ros.linked(ros.BEST_EFFORT, ros.BEST_EFFORT) as link:
+        answers = link.ground.messages, link.obstacles.messages
+        link.publish_until(to_message(street(500)), lambda: all(answers), 'clouds')
