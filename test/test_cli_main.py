@@ -22,15 +22,6 @@ from gp_ground_seg.lab.simulation import SCENES
 HEAVY = {'numba', 'scipy', 'matplotlib', 'pandas', 'rosbags', 'rclpy'}
 
 
-@pytest.mark.parametrize('name', cli.COMMANDS)
-def test_every_command_has_a_parser_and_explains_itself(name, capsys):
-    with pytest.raises(SystemExit, match='0'):
-        cli.main([name, '--help'])
-    text = capsys.readouterr().out
-    assert text.startswith(f'usage: gp-ground-seg {name}')
-    assert f'gp-ground-seg {name}' in text.partition('options:')[2]
-
-
 def test_the_help_groups_the_commands(capsys):
     with pytest.raises(SystemExit, match='0'):
         cli.main(['--help'])
@@ -137,6 +128,9 @@ def parsers_below(parser):
 @pytest.mark.parametrize('name', cli.COMMANDS)
 def test_every_help_has_examples_that_can_be_run(name, capsys):
     """Also of what is below a command; an example is taken by the parser as it stands."""
+    with pytest.raises(SystemExit, match='0'):
+        cli.main([name, '--help'])
+    assert capsys.readouterr().out.startswith(f'usage: gp-ground-seg {name}')
     parser = cli.build_parser(name)
     for leaf in parsers_below(parser):
         _, mark, text = leaf.epilog.partition('examples:\n')
@@ -154,14 +148,6 @@ def test_whatever_prints_a_table_has_json():
     found = {leaf.prog.split(' ', 1)[1] for leaf in leaves if '--json' in leaf.format_usage()}
     experiments = {f'experiment {name}' for name in EXPERIMENTS}
     assert found == {'evaluate'} | experiments
-    printing = set()
-    for leaf in leaves:
-        source = inspect.getsource(inspect.getmodule(leaf.get_default('run')))
-        if re.search(r'\.text\(\)|\bwritten\(', source):
-            printing.add(leaf.get_default('run').__module__)
-    assert printing == {
-        leaf.get_default('run').__module__ for leaf in leaves if '--json' in leaf.format_usage()
-    }
 
 
 @pytest.mark.parametrize('module', sorted({module for module, _ in cli.COMMANDS.values()}))

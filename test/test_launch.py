@@ -45,7 +45,7 @@ def test_rviz_is_told_of_each_topic_that_it_shows():
 
 OURS = 'gp_ground_seg', FILE.name
 WRONG = 'params_file:=/no/such.yaml', 'params:=3', 'rviz:=perhaps', 'required:=soon'
-GONE = [key.split()[1] for key in REMOVED if key.startswith(f'{FILE.name} ')]
+GONE = [key for key in REMOVED if key.startswith(f'{FILE.name} ')]
 
 
 def launched(*words):
@@ -65,36 +65,29 @@ def ros2_launch():
         pytest.skip('the workspace is not sourced')
 
 
-def test_launch_starts_the_node(ros2_launch):
-    lines = 'sensor.height: 1.2 m', 'listening to /lidar', 'front.ground_segmentation_node'
+def test_launch_starts_the_node_and_the_two_of_the_page(ros2_launch, tmp_path):
     words = 'topic:=/lidar', 'namespace:=front', 'params:={sensor.height: 1.2}'
     log = launched(*OURS, *words)
-    assert all(line in log for line in lines)
-
-
-def test_launch_starts_the_two_nodes_of_the_page(ros2_launch, tmp_path):
-    lines = 'listening to /lidar_front/points', 'listening to /lidar_rear/points'
+    for line in 'sensor.height: 1.2 m', 'listening to /lidar', 'front.ground_segmentation_node':
+        assert line in log
     path = tmp_path / 'two.launch.py'
     path.write_text(EXAMPLE)
     log = launched(path)
-    assert all(line in log for line in lines)
+    for name in 'front', 'rear':
+        assert f'listening to /lidar_{name}/points' in log
 
 
-@pytest.mark.parametrize('word', WRONG)
-def test_launch_refuses(ros2_launch, word):
-    name = word.partition(':=')[0]
-    assert f'{name}:=' in launched(*OURS, word)
-
-
-@pytest.mark.parametrize('name', GONE)
-def test_launch_says_what_to_use_instead(ros2_launch, name):
-    key = f'{FILE.name} {name}'
-    assert f'{key} was removed: {REMOVED[key]}' in launched(*OURS, f'{name}:=1')
-
-
-@pytest.mark.parametrize('word', ['rviz:=True', 'use_sim_time:=True'])
-def test_launch_takes_what_nav2_writes(ros2_launch, word):
-    assert 'listening to' in launched(*OURS, word)
+@pytest.mark.parametrize(
+    ('word', 'said'),
+    [
+        (WRONG[0], 'params_file:='),
+        (f'{GONE[0].split()[1]}:=1', f'{GONE[0]} was removed: {REMOVED[GONE[0]]}'),
+        ('rviz:=True', 'listening to'),  # as Nav2 writes it
+        ('use_sim_time:=True', 'listening to'),
+    ],
+)
+def test_launch_says_what_it_makes_of_an_argument(ros2_launch, word, said):
+    assert said in launched(*OURS, word)
 
 
 def test_launch_ends_with_the_node_and_its_code(ros2_launch):
@@ -228,13 +221,12 @@ def test_a_wrong_argument_starts_nothing(actions, word):
     assert failure_of(*actions(word)).startswith(word)
 
 
-@pytest.mark.parametrize('name', GONE)
-def test_an_argument_that_is_gone_says_what_to_use_instead(actions, name):
-    key = f'{FILE.name} {name}'
-    (said, options), (kind, _) = actions(f'{name}:=1')
+@pytest.mark.parametrize('key', GONE)
+def test_an_argument_that_is_gone_says_what_to_use_instead(actions, key):
+    (said, options), (kind, _) = actions(f'{key.split()[1]}:=1')
     assert (said, kind) == ('LogInfo', 'Node')
     assert options['msg'] == f'{key} was removed: {REMOVED[key]}'
-    ((kind, _),) = actions(f'{name}:=')
+    ((kind, _),) = actions(f'{key.split()[1]}:=')
     assert kind == 'Node'
 
 
