@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 from gp_ground_seg.cli import main as cli
@@ -12,6 +13,18 @@ from gp_ground_seg.cli import main as cli
 INTERRUPTED = (130, -signal.SIGINT)
 """Exit codes, 130 to a shell both: `python -m` ends by the signal itself where that came while
 code made from a string ran, as of `namedtuple` and `dataclass`, although it was caught."""
+
+
+PATIENCE = 120.0
+"""Time to wait for what has to happen [s]; only a failure takes that long."""
+
+
+def wait_for(condition, what):
+    """Return as soon as `condition` holds."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() <= end, f'after {PATIENCE:g} s still no {what}'
+        time.sleep(0.005)
 
 
 def run(*words):

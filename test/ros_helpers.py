@@ -22,6 +22,7 @@ with warnings.catch_warnings():
     import rosidl_generator_py  # noqa: F401
 
 import rclpy
+from cli_runner import PATIENCE, wait_for
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.context import Context
@@ -34,9 +35,6 @@ from sensor_msgs.msg import PointCloud2, PointField
 from gp_ground_seg.core.backend import choose_backend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.ros.node import CHANGED, FOLLOWS, GroundSegmentationNode, main
-
-PATIENCE = 120.0
-"""Time to wait for what has to happen [s]; only a failure takes that long."""
 
 # Other tests run beside this one, also as workers of pytest-xdist; nothing of them must be heard.
 _WORKER = os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw')
@@ -51,14 +49,6 @@ ISOLATION = {
 
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-
-def wait_for(condition, what):
-    """Return as soon as `condition` holds."""
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() <= end, f'after {PATIENCE:g} s still no {what}'
-        time.sleep(0.005)
 
 
 @contextlib.contextmanager

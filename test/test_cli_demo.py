@@ -7,12 +7,11 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import INTERRUPTED, children, is_running, start
+from cli_runner import INTERRUPTED, PATIENCE, children, is_running, start, wait_for
 
 from gp_ground_seg.cli import demo
 from gp_ground_seg.cli.bags import scan_cloud
@@ -24,8 +23,6 @@ from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
 from gp_ground_seg.ros import start_stop
 from gp_ground_seg.ros.node_process import NodeProcess, private_session
-
-PATIENCE = 120.0
 
 
 def sent_cloud(n=40, seed=0, stamp=5_000_000_007):
@@ -106,7 +103,7 @@ def test_demo_without_data(rclpy, tmp_path):
 )
 def test_a_stopped_demo_leaves_no_node(rclpy, tmp_path, number):
     with start('demo', '--frames', 500, cwd=tmp_path) as process:
-        wait_until(lambda: children(process.pid))
+        wait_for(lambda: children(process.pid), 'node')
         nodes = children(process.pid)
         # To this process alone, as `kill` does; a terminal tells the node too.
         process.send_signal(number)
@@ -116,14 +113,7 @@ def test_a_stopped_demo_leaves_no_node(rclpy, tmp_path, number):
         assert errors.splitlines()[-1] == 'gp-ground-seg: interrupted'
         assert not any(is_running(pid) for pid in nodes)
         assert list(tmp_path.iterdir()) == []
-    wait_until(lambda: not any(is_running(pid) for pid in nodes))
-
-
-def wait_until(condition):
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    wait_for(lambda: not any(is_running(pid) for pid in nodes), 'end of the node')
 
 
 def test_a_node_that_ends_is_said_and_one_that_runs_ends_with_its_block(rclpy, tmp_path):
@@ -136,7 +126,7 @@ def test_a_node_that_ends_is_said_and_one_that_runs_ends_with_its_block(rclpy, t
             if how:
                 os.kill(node.pid, how)
             with pytest.raises(GroundSegError, match=message):
-                wait_until(node.check)
+                wait_for(node.check, 'end of the node')
     node = NodeProcess(log)
     with contextlib.suppress(ZeroDivisionError), node:
         assert is_running(node.pid)
@@ -156,7 +146,7 @@ def test_the_node_imports_nothing_from_the_current_folder(rclpy, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     log = tmp_path / 'log'
     with private_session('link') as (session, words), NodeProcess(log, words) as node:
-        wait_until(lambda: node.check() or 'listening to' in log.read_text())
+        wait_for(lambda: node.check() or 'listening to' in log.read_text(), 'start')
         namespace = session.node.get_namespace()
         assert f'listening to {namespace}/points' in log.read_text()
     with private_session('link') as (session, _):

@@ -7,13 +7,12 @@ import io
 import math
 import re
 import signal
-import time
 from pathlib import Path
 
 import bag_samples as samples
 import numpy as np
 import pytest
-from cli_runner import error_line, run, start
+from cli_runner import error_line, run, start, wait_for
 from evaluation_samples import label_files
 
 from gp_ground_seg import Config, GroundSegmenter, Label
@@ -429,15 +428,14 @@ def long_inputs(tmp_path_factory):
 def stop_in_the_middle(tmp_path, source, out, how, *words):
     """Stop `segment` once it has written something; return its exit code and last line."""
     process = start('segment', source, '-o', tmp_path / out, *words)
-    deadline = time.monotonic() + 60
-    size = 0
-    while size < 2_000_000:
+
+    def has_begun():
         assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
         parts = [*tmp_path.glob('.*.partial-*/**/*'), *tmp_path.glob('labels/*.label')]
         with contextlib.suppress(FileNotFoundError):
-            size = sum(part.stat().st_size for part in parts if part.is_file())
+            return sum(part.stat().st_size for part in parts if part.is_file()) > 2_000_000
+
+    wait_for(has_begun, 'output')
     process.send_signal(how)
     _, said = process.communicate(timeout=30)
     # Where numba is missing, a line says so first.

@@ -4,13 +4,12 @@ import json
 import os
 import shutil
 import signal
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bag_samples import scan, write_ros2_bag
-from cli_runner import INTERRUPTED, children, error_line, is_running, run, start
+from cli_runner import INTERRUPTED, children, error_line, is_running, run, start, wait_for
 from evaluation_samples import label_files, write_streets, write_two_drives
 
 from gp_ground_seg.cli import options
@@ -205,17 +204,15 @@ def long_root(tmp_path_factory):
 
 
 def wait_for_lines(process, manifest, n):
-    deadline = time.monotonic() + 120
-    while not (manifest.exists() and manifest.read_bytes().count(b'\n') >= n):
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.02)
+    def is_there():
+        assert process.poll() is None
+        return manifest.exists() and manifest.read_bytes().count(b'\n') >= n
+
+    wait_for(is_there, f'{n} lines')
 
 
 def assert_gone(pids):
-    deadline = time.monotonic() + 30
-    while any(map(is_running, pids)):
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
+    wait_for(lambda: not any(map(is_running, pids)), 'end of all processes')
 
 
 @pytest.mark.slow
