@@ -1,7 +1,6 @@
 """The package as a whole: versions, layers, dependencies."""
 
 import ast
-import os
 import re
 import shlex
 import shutil
@@ -118,22 +117,6 @@ def test_the_tools_of_ros_take_package_xml_and_changelog_and_set_the_version(tmp
     assert "version='9.8.7'," in (tmp_path / 'setup.py').read_text()
 
 
-def loaded_by(statement):
-    script = f'import sys; {statement}; print(*sys.modules)'
-    done = subprocess.run(
-        [sys.executable, '-c', script], capture_output=True, text=True, check=True
-    )
-    return {name.split('.')[0] for name in done.stdout.split()}
-
-
-def test_importing_the_library_imports_neither_ros_nor_tools():
-    loaded = loaded_by('from gp_ground_seg import *')
-    assert 'numpy' in loaded
-    assert not loaded & {'rclpy', 'sensor_msgs', 'matplotlib', 'rosbags', 'tqdm'}
-    # The package by itself takes no time.
-    assert not loaded_by('import gp_ground_seg') & {'numpy', 'scipy', 'numba'}
-
-
 def test_every_public_name_is_there():
     for name in gp_ground_seg.__all__:
         assert getattr(gp_ground_seg, name) is not None
@@ -196,22 +179,3 @@ def test_a_hint_says_where_pip_works(tmp_path, monkeypatch):
     assert install_hint('rosbags') == there
     monkeypatch.setattr(sys, 'prefix', '/elsewhere')
     assert install_hint('rosbags') == here
-
-
-def test_a_warning_is_an_error_in_tests_and_not_where_plugins_are_imported(tmp_path):
-    """One of launch_testing ended ``colcon test`` before the first test."""
-    found = tmp_path / 'early-1.0.dist-info'
-    found.mkdir()
-    (found / 'METADATA').write_text('Metadata-Version: 2.1\nName: early\nVersion: 1.0\n')
-    (found / 'entry_points.txt').write_text('[pytest11]\nearly = early\n')
-    warn = "import warnings\n{}warnings.warn('{}', DeprecationWarning)\n"
-    (tmp_path / 'early.py').write_text(warn.format('', 'early'))
-    (tmp_path / 'test_late.py').write_text(warn.format('def test_late(): ', 'late'))
-    words = '-c', REPOSITORY / 'pyproject.toml', '-p', 'conftest', tmp_path / 'test_late.py'
-    path = os.pathsep.join(map(str, [tmp_path, REPOSITORY / 'test', *sys.path]))
-    done = subprocess.run(
-        [sys.executable, '-m', 'pytest', *words], capture_output=True, text=True,
-        # The options that colcon passes so name modules: of this one, for ever.
-        env={**os.environ, 'PYTHONPATH': path, 'NUMBA_DISABLE_JIT': '1', 'PYTEST_ADDOPTS': ''},
-    )  # fmt: skip
-    assert done.returncode == 1 and 'DeprecationWarning: late' in done.stdout, done.stderr
