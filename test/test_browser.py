@@ -61,16 +61,6 @@ class Page:
         (SCREENSHOTS / name).write_bytes(data)
         return (255.0 * np.asarray(imread(io.BytesIO(data), format='png'))).round()[..., :3]
 
-    def drag(self, selector, number, pixels):
-        """Drag an element to the right."""
-        element = self.driver.find_elements('css selector', selector)[number]
-        chain = webdriver.ActionChains(self.driver)
-        chain.drag_and_drop_by_offset(element, pixels, 0).perform()
-
-    def click(self, words):
-        """Click the button with these words on it."""
-        self.driver.find_element('xpath', f'//button[contains(., "{words}")]').click()
-
 
 @pytest.fixture
 def page():
@@ -118,7 +108,9 @@ def test_a_slider_changes_labels_and_colours_and_a_button_writes_them(tune, page
 
     names = re.findall(r'^([\w.]+)(?: \[[^\]]+\])?$', page.text, re.MULTILINE)
     numbers = [name for name in names if name in ('frame', *NUMBERS)]
-    page.drag('.mantine-Slider-thumb', numbers.index('label.ground_tolerance'), 60)
+    sliders = page.driver.find_elements('css selector', '.mantine-Slider-thumb')
+    slider = sliders[numbers.index('label.ground_tolerance')]
+    webdriver.ActionChains(page.driver).drag_and_drop_by_offset(slider, 60, 0).perform()
     page.wait_for(lambda: re.search(r'^[1-9][\d ]* changed', page.text, re.MULTILINE), 'change')
     n_ground, n_before = re.search(r'ground\t([\d ]+)\t([\d ]+)', page.text).groups()
     assert int(n_ground.replace(' ', '')) > int(n_before.replace(' ', ''))
@@ -126,7 +118,7 @@ def test_a_slider_changes_labels_and_colours_and_a_button_writes_them(tune, page
         page, 'tune_moved.png', lambda n: n['now ground'] > before['now ground'] + 100
     )
 
-    page.click('tuned.yaml')
+    page.driver.find_element('xpath', '//button[contains(., "tuned.yaml")]').click()
     page.wait_for(lambda: f'written to {output}' in page.text, 'file')
     written = Config.from_yaml(output)
     value = written.label.ground_tolerance

@@ -2,9 +2,9 @@
 
 import ast
 import re
-import signal
 import subprocess
 import sys
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
@@ -142,47 +142,21 @@ def actions(monkeypatch, tmp_path):
     return actions
 
 
-def command_of(node):
-    """Arguments that launch_ros makes of the options of a node; parameters given by name."""
-    words = ['--ros-args', '-r', f'__node:={node["name"]}', *node['ros_arguments']]
-    words += ['-r', f'__ns:=/{node["namespace"]}'] if node['namespace'] else []
-    words += [word for pair in node['remappings'] for word in ('-r', ':='.join(pair))]
-    given = (item for values in node['parameters'] for item in values.items())
-    return words + [word for name, v in given for word in ('-p', f'{name}:={str(v).lower()}')]
-
-
-def test_each_argument_reaches_the_node(actions, tmp_path):
-    ros = pytest.importorskip('ros_helpers', reason='ROS is not installed')
-    namespace = ros.NAMESPACE.strip('/')
+def test_each_argument_reaches_the_node(actions):
     (_, node), (kind, note) = actions(
-        'topic:=lidar', f'namespace:={namespace}', 'log_level:=debug', 'use_sim_time:=True',
-        'rviz:=1', 'params:={diagnostics.period: 0.1}',
+        'topic:=lidar', 'namespace:=/front/', 'log_level:=debug', 'use_sim_time:=True', 'rviz:=1',
+        'params_file:=paper', 'params:={diagnostics.period: 0.1}',
     )  # fmt: skip
     # There is no RViz here: one line says so, and the node starts.
     assert kind == 'LogInfo' and 'rviz2 is not installed' in note['msg']
-    with (
-        ros.Process(*command_of(node), folder=tmp_path) as process,
-        ros.isolated_context() as context,
-    ):
-        probe = ros.Node('probe', context=context, namespace=ros.NAMESPACE)
-        lidar = probe.create_publisher(ros.PointCloud2, 'lidar', ros.RELIABLE)
-        outputs = [ros.Collector(probe, ros.PointCloud2, name) for name in ('ground', 'obstacles')]
-        reports = ros.Collector(probe, ros.DiagnosticArray, '/diagnostics')
-        with ros.spinning(context, probe):
-            cloud = ros.to_message(ros.street(1000))
-            ros.wait_for(
-                lambda: lidar.publish(cloud) or all(o.messages for o in outputs), 'both outputs'
-            )
-            n_reports = len(reports.messages)
-            statuses = reports.wait(n_reports + 2)[-1].status
-        full_name = f'{ros.NAMESPACE}/ground_segmentation_node'
-        assert {status.hardware_id for status in statuses} == {full_name}
-        values = {k: v for status in statuses for k, v in ros.values_of(status).items()}
-        assert values['Clock'].startswith('simulated')
-        # The log of the node, and of nothing else.
-        loggers = re.findall(r'\[DEBUG\] \[[\d.]+\] \[([\w.]+)\]', process.log)
-        assert set(loggers) == {f'{namespace}.ground_segmentation_node'}
-        assert process.stop(signal.SIGINT)[0] == 0
+    name = dict(constants(FILE))['NODE']
+    assert (node['package'], node['executable'], node['name']) == ('gp_ground_seg', name, name)
+    assert (node['namespace'], node['remappings']) == ('front', [('points', 'lidar')])
+    path, values = node['parameters']
+    assert Path(path).samefile(REPOSITORY / 'config' / 'paper.yaml')
+    assert values == {'diagnostics.period': 0.1, 'use_sim_time': True}
+    # The log of the node, and of nothing else.
+    assert node['ros_arguments'] == ['--log-level', f'front.{name}:=debug']
 
 
 @pytest.mark.parametrize('text', ['false', 'False', '0'])
@@ -191,12 +165,9 @@ def test_nothing_else_starts_unless_asked_for(actions, text):
     assert node['parameters'] == []
 
 
-def test_launch_ends_with_a_node_that_fails_unless_it_is_not_required(actions, tmp_path):
-    ros = pytest.importorskip('ros_helpers', reason='ROS is not installed')
-    ((_, node),) = actions('params:={grid.r_max: -1.0}')
-    with ros.Process(*command_of(node), folder=tmp_path) as process:
-        code = process.popen.wait(ros.PATIENCE)
-    event = SimpleNamespace(returncode=code, process_name='node-1')
+def test_launch_ends_with_a_node_that_fails_unless_it_is_not_required(actions):
+    ((_, node),) = actions()
+    event = SimpleNamespace(returncode=2, process_name='node-1')
     with pytest.raises(RuntimeError, match='node-1 ended with exit code 2'):
         node['on_exit'](event, SimpleNamespace(is_shutdown=False))
     for event.returncode, is_shutdown in ((2, True), (0, False)):

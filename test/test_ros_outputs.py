@@ -1,6 +1,7 @@
-"""The optional topics: what is in them, and that nobody pays for them unasked."""
+"""The topics: every byte of a cloud, and the optional ones, which cost nothing unasked."""
 
 import dataclasses
+from array import array
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.parameters.schema import NODE_NAME
+from gp_ground_seg.core.pipeline.points import single_precision
 from gp_ground_seg.data import costmap
 from gp_ground_seg.data.costmap import Placement, SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_columns, read_xyz
@@ -253,3 +255,89 @@ def test_quality_of_service_of_every_output_can_be_overridden():
         for _, publisher in node._outputs._publishers:
             assert publisher.qos_profile.depth == 3
             assert publisher.qos_profile.reliability.name == 'BEST_EFFORT'
+
+
+# Clouds of four layouts through the real node, over DDS; test_point_cloud2.py has any.
+
+CODES = ('i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'f4', 'f8')
+CASES = {
+    'one row without row_step': ('<f4', (1, 200), 0, 0.1),
+    'double precision, big-endian, padded rows': ('>f8', (5, 40), 13, 0.0),
+    'nothing finite': ('<f8', (3, 7), 1, 1.0),
+    'no point': ('>f4', (0, 3), 0, 0.0),
+}
+"""Type of the coordinates, rows by columns, bytes behind each row, share that is not finite."""
+
+
+def cloud_of(code, shape, padding, share):
+    """Message with gaps and further fields, coordinates (N, 3), and the bytes of each point."""
+    rng, (height, width) = np.random.default_rng(0), shape
+    types = {'ring': 'u2', 'z': code[1:], 'label': 'u1', 'x': code[1:], 'réflexion': 'f8'}
+    types |= {'y': code[1:], 'height': 'i4'}
+    sizes = [np.dtype(name).itemsize for name in types.values()]
+    starts = 3 * np.arange(1, len(sizes) + 1) + np.cumsum([0, *sizes[:-1]])
+    dtype = np.dtype({
+        'names': [*types], 'formats': [code[0] + name for name in types.values()],
+        'offsets': starts, 'itemsize': starts[-1] + sizes[-1] + 5,
+    })  # fmt: skip
+    raw = rng.integers(0, 256, (height * width, dtype.itemsize), dtype=np.uint8)
+    points = raw.view(dtype)[:, 0]
+    source = ros.street(len(points))
+    for axis in 'xyz':
+        bad = rng.random(len(points)) < share
+        points[axis] = source[axis]
+        points[axis][bad] = rng.choice([np.nan, np.inf, -np.inf], bad.sum())
+    points['x'][:1] = 500.0  # beyond the grid: no height there
+    rows = raw.reshape(height, width * dtype.itemsize)
+    rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=7)
+    message = PointCloud2(height=height, width=width, point_step=dtype.itemsize)
+    message.row_step, message.is_bigendian = rows.shape[1] * (height != 1), code[0] == '>'
+    message.fields = [
+        PointField(name=name, offset=dtype.fields[name][1], datatype=1 + CODES.index(of), count=1)
+        for name, of in types.items()
+    ]
+    message.header.frame_id = 'velo_link'
+    message.header.stamp.sec, message.header.stamp.nanosec = -height, 999_999_999
+    message.data = array('B', rows.tobytes())
+    xyz = np.stack([points[axis].astype(code[1:]) for axis in 'xyz'], axis=-1)
+    return message, xyz, [row.tobytes() for row in raw]
+
+
+@pytest.mark.parametrize('case', CASES)
+def test_every_byte_comes_through_with_labels_as_of_the_library(b, case):
+    message, xyz, rows = cloud_of(*CASES[case])
+    expected = GroundSegmenter(CONFIG).segment(single_precision(xyz))
+    labelled = b.listen('~/labeled')
+    parts = b.segment(message)
+
+    for part, wanted in zip(parts, (Label.GROUND, Label.OBSTACLE), strict=True):
+        kept = [row for row, label in zip(rows, expected.label, strict=True) if label == wanted]
+        for name in ('header', 'fields', 'is_bigendian', 'point_step'):
+            assert getattr(part, name) == getattr(message, name)
+        assert (part.height, part.width) == (1, len(kept))
+        assert part.row_step == len(kept) * message.point_step
+        assert bytes(part.data) == b''.join(kept)
+        assert part.is_dense
+    assert parts[0].width + parts[1].width == np.isfinite(xyz).all(axis=1).sum()
+
+    (whole,) = labelled.wait(1)
+    b.in_executor(b.probe.destroy_subscription, labelled.subscription)
+    for name in ('header', 'height', 'width', 'is_bigendian'):
+        assert getattr(whole, name) == getattr(message, name)
+    assert whole.row_step == message.width * whole.point_step
+    assert whole.fields[: len(message.fields)] == message.fields
+    names = list(labelled_names(field.name for field in message.fields).values())
+    added = whole.fields[len(message.fields) :]
+    assert [field.name for field in added] == names
+    assert [CODES[field.datatype - 1] for field in added] == ['u1', *['f4'] * 5]
+    raw = np.frombuffer(whole.data, np.uint8).reshape(len(rows), whole.point_step)
+    assert [row[: message.point_step].tobytes() for row in raw] == rows
+    is_dense = np.isfinite(xyz).all()
+    for field, name in zip(added, FIELDS, strict=True):
+        code = CODES[field.datatype - 1]
+        column = raw[:, field.offset : field.offset + int(code[1])]
+        order = '>' if message.is_bigendian else '<'
+        values = np.ascontiguousarray(column).view(order + code).ravel()
+        np.testing.assert_array_equal(values, getattr(expected, name).astype(code))
+        is_dense &= np.isfinite(values).all()
+    assert whole.is_dense == is_dense
