@@ -5,9 +5,6 @@ import sys
 import threading
 
 import pytest
-
-pytest.importorskip('rclpy', reason='ROS is not installed')
-
 import ros_helpers as ros
 from cli_runner import run
 from ros_helpers import street, to_message

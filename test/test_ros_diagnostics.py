@@ -5,18 +5,14 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+import ros_helpers  # noqa: F401  imports type support without its warnings
 from conftest import hilly_scan
 from hypothesis import given
 from hypothesis import strategies as st
+from rclpy.duration import Duration
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.parameters.config import DiagnosticsConfig
-
-pytest.importorskip('rclpy', reason='ROS is not installed')
-
-import ros_helpers  # noqa: F401  imports type support without its warnings
-from rclpy.duration import Duration
-
 from gp_ground_seg.ros import diagnostics
 from gp_ground_seg.ros.diagnostics import (
     RATE_WINDOW,

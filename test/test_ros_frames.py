@@ -9,13 +9,10 @@ import types
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
-pytest.importorskip('rclpy', reason='ROS is not installed')
-
 import ros_helpers as ros
 from geometry_msgs.msg import Quaternion, TransformStamped
+from hypothesis import given
+from hypothesis import strategies as st
 from nav_msgs.msg import OccupancyGrid
 from rclpy.time import Time
 from ros_helpers import bench, street, to_message, wait_for, xyz_of

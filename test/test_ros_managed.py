@@ -7,9 +7,6 @@ import time
 
 import numpy as np
 import pytest
-
-pytest.importorskip('rclpy', reason='ROS is not installed')
-
 import ros_helpers as ros
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState

@@ -6,11 +6,8 @@ import time
 
 import numpy as np
 import pytest
-import yaml
-
-pytest.importorskip('rclpy', reason='ROS is not installed')
-
 import ros_helpers as ros
+import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock_type import ClockType
 from rclpy.logging import LoggingSeverity

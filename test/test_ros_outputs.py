@@ -5,9 +5,6 @@ from array import array
 
 import numpy as np
 import pytest
-
-pytest.importorskip('rclpy', reason='ROS is not installed')
-
 import ros_helpers as ros
 from nav_msgs.msg import OccupancyGrid
 from ros_helpers import said_by, stderr_in, street, to_message, wait_for, xyz_of

@@ -2,15 +2,12 @@
 
 import numpy as np
 import pytest
+import ros_helpers as ros
 import yaml
 from config_samples import configs
 from conftest import REPOSITORY
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-pytest.importorskip('rclpy', reason='ROS is not installed')
-
-import ros_helpers as ros
 from rcl_interfaces import srv
 from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter, parameter_value_to_python

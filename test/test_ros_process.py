@@ -6,9 +6,6 @@ import time
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip('rclpy', reason='ROS is not installed')
-
 import ros_helpers as ros
 from conftest import REPOSITORY
 from diagnostic_msgs.msg import DiagnosticStatus

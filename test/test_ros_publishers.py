@@ -3,13 +3,10 @@
 import contextlib
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
-pytest.importorskip('rclpy', reason='ROS is not installed')
-
 import ros_helpers as ros
 from diagnostic_msgs.msg import DiagnosticStatus
+from hypothesis import given
+from hypothesis import strategies as st
 from ros_helpers import BEST_EFFORT, NAMESPACE, RELIABLE, street, to_message, wait_for
 from sensor_msgs.msg import LaserScan, PointCloud2
 

@@ -6,15 +6,12 @@ import signal
 import subprocess
 import sys
 
-import pytest
-from conftest import REPOSITORY
-
-pytest.importorskip('rclpy', reason='ROS is not installed')
-
 import cli_runner
+import pytest
 import ros_helpers as ros
 from bag_samples import write_ros2_bag
 from cli_runner import children, is_running, stat_words
+from conftest import REPOSITORY
 from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 
 from gp_ground_seg.core.jit import HAVE_NUMBA
