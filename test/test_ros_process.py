@@ -1,5 +1,6 @@
 """The node, drivers and players, each a process: what comes back, what diagnostics say."""
 
+import contextlib
 import signal
 import sys
 import time
@@ -9,39 +10,45 @@ import pytest
 import ros_helpers as ros
 from conftest import REPOSITORY
 from diagnostic_msgs.msg import DiagnosticStatus
+from hypothesis import given
+from hypothesis import strategies as st
 from rcl_interfaces.msg import ParameterType
-from ros_helpers import NAMESPACE, street, to_message
+from ros_helpers import BEST_EFFORT, NAMESPACE, RELIABLE, street, to_message, wait_for
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import LaserScan, PointCloud2
 
-from gp_ground_seg.ros.input import NO_TIME
+from gp_ground_seg.ros.input import NO_TIME, SequenceGaps
 
-# A busy machine must not look like a fault; everything else may.
-PATIENT = {
-    'diagnostics.period': 0.2,
-    'diagnostics.stale_after': 60.0,
-    'diagnostics.max_latency': 10.0,
-}
-# Nor be one: a node that cannot run for four seconds at 10 Hz loses nothing.
-WORDS = ros.given({**PATIENT, f'qos_overrides.{NAMESPACE}/points.subscription.depth': 40})
+# A busy machine must not look like a fault.
+CHANGES = {
+    'diagnostics.period': 0.2, 'diagnostics.max_latency': 10.0, 'diagnostics.stale_after': 60.0,
+    f'qos_overrides.{ros.NAMESPACE}/points.subscription.depth': 5,
+}  # fmt: skip
+SMALL = to_message(street(500))
+MIDDLE = to_message(street(6000))
+"""A cloud of 0.4 MB, which stock Fast DDS loses from no publisher."""
+LARGE = to_message(street(30_000))
+"""A cloud of 1.9 MB."""
 
 
 @pytest.fixture(scope='module')
 def node(tmp_path_factory):
-    folder = tmp_path_factory.mktemp('node')
-    with ros.Process(*ros.IN_NAMESPACE, *WORDS, folder=folder) as process:
+    """A node in a process of its own, started before any publisher."""
+    words = *ros.IN_NAMESPACE, *ros.given(CHANGES)
+    with ros.Process(*words, folder=tmp_path_factory.mktemp('node')) as process:
         process.wait_until_settled()
         yield process
         assert process.stop(signal.SIGINT)[0] == 0
         assert 'Traceback' not in process.log
-        # Large clouds of a best-effort driver are warned of.
+        # Of drivers and clocks that the tests have sent.
         warnings = [line for line in process.log.splitlines() if 'WARN' in line]
-        assert all('come best-effort' in line or NO_TIME in line for line in warnings)
+        wanted = 'come best-effort', 'is sent there', NO_TIME
+        assert all(any(text in line for text in wanted) for line in warnings)
 
 
 @pytest.mark.usefixtures('node')
 def test_clouds_of_two_megabytes_at_10_hz_all_come_back():
-    message = to_message(street(30_000, n_invalid=100), frame='velo_link')
-    assert len(message.data) == 1_920_000
+    message = to_message(street(30_000, n_invalid=100))
     with ros.linked() as link:
         next_time = time.monotonic()
         for k in range(20):
@@ -77,7 +84,7 @@ def test_what_rclpy_raises_does_not_end_the_node(node):
         assert link.set('use_sim_time', True).successful
         publisher, clock = link.probe.create_publisher(Clock, '/clock', 1), Clock()
         clock.clock.sec = -5
-        ros.wait_for(lambda: publisher.publish(clock) or 'negative' in node.log, 'message')
+        wait_for(lambda: publisher.publish(clock) or 'negative' in node.log, 'message')
         link.segment(to_message(street(500)))
         assert link.set('use_sim_time', False).successful
 
@@ -93,7 +100,7 @@ def test_simulated_time_without_a_clock_is_said(node):
         assert '[WARN]' in line
         publisher, clock = link.probe.create_publisher(Clock, '/clock', 1), Clock()
         clock.clock.sec = 5
-        ros.wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription of /clock')
+        wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription of /clock')
 
         def has_time(_, status):
             publisher.publish(clock)  # the first may be lost: both sides must know each other
@@ -101,6 +108,168 @@ def test_simulated_time_without_a_clock_is_said(node):
 
         link.wait_for_status('input', has_time)
         assert link.set('use_sim_time', False).successful
+
+
+# Publishers: reliable, best-effort, both, changing; their losses are counted.
+
+
+@pytest.fixture
+def link(node):
+    with ros.linked(sends=None) as link:
+        # The node may still have clouds of the test before.
+        while counts(link) != counts(link):
+            pass
+        for collector in (link.ground, link.obstacles):
+            collector.messages.clear()
+        yield link
+
+
+def add_publisher(link, qos, reliability, n_publishers=1):
+    """Another publisher; returns once the node has a subscription of that reliability for it."""
+    publisher = link.probe.create_publisher(PointCloud2, 'points', qos)
+    wait_until_followed(link, reliability, n_publishers)
+    wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription')
+    return publisher
+
+
+def wait_until_followed(link, reliability, n_publishers):
+    wanted = f'{reliability}, keep_last 5, volatile'
+    link.wait_for_status(
+        'input', lambda v, _: (v['QoS'], v['Publishers']) == (wanted, str(n_publishers))
+    )
+
+
+def counts(link):
+    """Clouds that the node has lost and processed since its start."""
+    values = ros.values_of(link.wait_for_status('processing', lambda *_: True))
+    return int(values['Dropped since startup']), int(values['Clouds since startup'])
+
+
+def send_and_wait(link, message, *publishers):
+    """Send five clouds from each publisher, one after the other; all of them must come back."""
+    n_answers = len(link.ground.messages)
+    n_lost = counts(link)[0]
+    for _ in range(5):
+        for publisher in publishers:
+            publisher.publish(message)
+            n_answers += 1
+            link.ground.wait(n_answers)
+    assert counts(link)[0] == n_lost
+    assert len(link.ground.messages) == len(link.obstacles.messages) == n_answers
+
+
+def remove(link, publisher):
+    link.probe.executor.create_task(link.probe.destroy_publisher, publisher)
+
+
+@pytest.mark.slow
+def test_every_cloud_comes_however_the_publishers_change(link):
+    reliable = add_publisher(link, RELIABLE, 'reliable')
+    send_and_wait(link, LARGE, reliable)
+    best_effort = add_publisher(link, BEST_EFFORT, 'best_effort', 2)
+    send_and_wait(link, MIDDLE, reliable, best_effort)
+    remove(link, reliable)
+    wait_until_followed(link, 'best_effort', 1)
+    send_and_wait(link, MIDDLE, best_effort)
+    # A driver ends and a bag is played: its first clouds are not lost to a best-effort reader.
+    remove(link, best_effort)
+    wait_until_followed(link, 'reliable', 0)
+    reliable = add_publisher(link, RELIABLE, 'reliable')
+    send_and_wait(link, LARGE, reliable)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('qos', [RELIABLE, BEST_EFFORT])
+def test_losses_of_two_publishers_are_counted(link, qos):
+    first = add_publisher(link, RELIABLE, 'reliable')
+    used = 'reliable' if qos is RELIABLE else 'best_effort'
+    second = add_publisher(link, qos, used, 2)
+    before = counts(link)
+    message = to_message(street(2000))
+    for n_clouds in (1, 40, 1):
+        for _ in range(n_clouds):
+            first.publish(message)
+            second.publish(message)
+        n_dropped, n_processed = counts_when_quiet(link)
+    assert n_dropped - before[0] > 20
+    assert n_dropped + n_processed - sum(before) == 2 * 42
+
+
+def counts_when_quiet(link):
+    """The counts, once a second has brought no answer."""
+    while True:
+        n_answers, start = len(link.ground.messages), len(link.diagnostics.messages)
+        link.diagnostics.wait(start + 5)
+        if 0 < n_answers == len(link.ground.messages):
+            return counts(link)
+
+
+def test_large_clouds_that_come_best_effort_are_a_warning(node, link):
+    link.publisher = add_publisher(link, BEST_EFFORT, 'best_effort')
+    link.publish_until(LARGE, lambda: len(link.ground.messages) >= 2, 'answer')
+    status = link.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.WARN)
+    assert 'clouds of 1.9 MB come best-effort' in status.message
+    assert 'FASTRTPS_DEFAULT_PROFILES_FILE' in status.message
+    (line,) = [line for line in node.log.splitlines() if 'come best-effort' in line]
+    assert '[WARN]' in line and f'{NAMESPACE}/points' in line
+
+
+@contextlib.contextmanager
+def driver_of(message_type):
+    """A publisher of best-effort messages of that type, on the topic of the clouds."""
+    with ros.isolated_context() as context:
+        driver = ros.Node('driver', context=context, namespace=NAMESPACE)
+        driver.create_publisher(message_type, 'points', BEST_EFFORT)
+        with ros.spinning(context, driver):
+            yield
+
+
+def test_messages_of_another_type_are_named(node, link):
+    wanted = 'sensor_msgs/msg/LaserScan is sent there, and sensor_msgs/msg/PointCloud2 is wanted'
+    assert link.set('diagnostics.stale_after', 0.5).successful
+    with driver_of(LaserScan):
+        status = link.wait_for_status(
+            'input', lambda _, s: s.level == DiagnosticStatus.STALE and wanted in s.message
+        )
+        assert f'no cloud on {NAMESPACE}/points for' in status.message
+        # It follows the publishers of clouds only, and this one offers best effort.
+        assert 'reliable, keep_last 5' in ros.values_of(status)['QoS']
+        assert ros.values_of(status)['Publishers'] == '0'
+        assert link.set('diagnostics.stale_after', 60.0).successful
+        # Clouds beside it still come.
+        send_and_wait(link, SMALL, add_publisher(link, RELIABLE, 'reliable'))
+        status = link.wait_for_status('input', lambda _, s: wanted in s.message)
+        assert status.level == DiagnosticStatus.WARN
+    link.wait_for_status('input', lambda _, s: wanted not in s.message)
+    (line,) = [line for line in node.log.splitlines() if wanted in line]
+    assert '[WARN]' in line and f'on {NAMESPACE}/points' in line
+
+
+@given(st.lists(st.booleans(), min_size=1))
+def test_gaps_count_what_is_missing_between_arrivals(is_received):
+    gaps = SequenceGaps()
+    counted = sum(gaps.note(k) for k, received in enumerate(is_received, 1) if received)
+    inner = ''.join('x' if received else '.' for received in is_received).strip('.')
+    assert counted == inner.count('.')
+    # Another publisher counts from the start.
+    gaps.reset()
+    assert [gaps.note(n) for n in (7, 8, 1, 2, 5, None, 200)] == [0, 0, 0, 0, 2, 0, 0]
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 5)), max_size=50), st.booleans())
+def test_gaps_of_two_publishers_add_up(steps, are_near):
+    gaps, last = SequenceGaps(), [1000, 1000 if are_near else 1]
+    assert [gaps.note(number, 2) for number in last] == [0, 0]
+    counted = lost = 0
+    for which, n_lost in steps:
+        last[which] += 1 + n_lost
+        counted += gaps.note(last[which], 2)
+        lost += n_lost
+    # Of numbers that are near, a loss may be counted with the next cloud of either.
+    for which in sorted((0, 1), key=last.__getitem__):
+        last[which] += 1
+        counted += gaps.note(last[which], 2)
+    assert counted == lost
 
 
 # Sends best-effort clouds of 1.9 MB until it is ended; its domain is that of the environment.
@@ -137,6 +306,6 @@ def test_best_effort_driver_with_the_large_segment_profile(node, tmp_path):
 
 @pytest.mark.usefixtures('node')
 def test_a_best_effort_subscriber_is_served():
-    with ros.linked(ros.BEST_EFFORT, ros.BEST_EFFORT) as link:
+    with ros.linked(BEST_EFFORT, BEST_EFFORT) as link:
         answers = link.ground.messages, link.obstacles.messages
         link.publish_until(to_message(street(500)), lambda: all(answers), 'clouds')
