@@ -293,6 +293,12 @@ class Link:
         """Result of ``ros2 param set``."""
         return self.load({name: value})[0]
 
+    def refusal(self, name, value):
+        """Reason for which a value is refused."""
+        result = self.set(name, value)
+        assert not result.successful
+        return result.reason
+
     def load(self, values):
         """Results of setting all values at once, in their order, as ``ros2 param load`` does."""
         return self.request(SetParameters, parameter_messages(values))

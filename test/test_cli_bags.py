@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 
 import numpy as np
@@ -24,7 +23,6 @@ from ros_helpers import BEST_EFFORT, ISOLATION, PATIENCE, isolated_context, spin
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.cli import options
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
 from gp_ground_seg.ros import playback, start_stop
@@ -175,35 +173,6 @@ def test_nobody_listens(tmp_path, capsys):
     assert capsys.readouterr().out == '1 cloud sent in 0.0 s\n'
 
 
-def test_waits_and_says_so(tmp_path, capsys, monkeypatch):
-    bag = drive(tmp_path, 2)
-    is_said = threading.Event()
-
-    tell = options.note
-
-    def note(text):
-        tell(text)
-        if text.startswith('waiting'):
-            is_said.set()
-
-    monkeypatch.setattr(options, 'note', note)
-    with isolated_context() as context:
-        node = Node('late', context=context)
-        clouds = []
-
-        def come_late():
-            is_said.wait(PATIENCE)
-            node.create_subscription(PointCloud2, '/points', clouds.append, RELIABLE)
-
-        thread = threading.Thread(target=come_late)
-        thread.start()
-        assert play(bag) == 0
-        thread.join()
-        with spinning(context, node):
-            wait_for(lambda: len(clouds) == 2, 'last cloud')
-    assert WAITING in capsys.readouterr().err.splitlines()
-
-
 @contextlib.contextmanager
 def program(*words, code=('-m', 'gp_ground_seg', 'play')):
     """The command in a process of its own."""
@@ -215,6 +184,15 @@ def program(*words, code=('-m', 'gp_ground_seg', 'play')):
             yield process
         finally:
             process.kill()
+
+
+def test_waits_and_says_so(tmp_path):
+    with program(drive(tmp_path, 2)) as process:
+        while process.stderr.readline() != f'{WAITING}\n':
+            assert process.poll() is None
+        with listening('/points') as listener:
+            wait_for(lambda: len(listener.clouds['/points']) == 2, 'last cloud')
+            assert process.wait(PATIENCE) == 0
 
 
 def test_loop_until_interrupted(tmp_path):

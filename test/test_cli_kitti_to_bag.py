@@ -101,18 +101,13 @@ def test_all_by_force_at_ten_hertz(tmp_path, capsys):
         (TIMES, ['--sequence', '99'], r'sequences/99: no velodyne folder.*sequences here: 04'),
         ([-0.2, 0.1, 0.2, 0.3, 0.4], [], r'time -0\.2 s of frame 000000: must be in'),
         ([0, 0.1, 0.2, 0.3, 1e10], [], r'time 1e\+10 s of frame 000004: must be in'),
+        (None, [], r'000003\.label: 8 bytes, expected 7204'),
     ],
 )
 def test_refused(tmp_path, capsys, times, words, message):
-    write_sequence(tmp_path / 'kitti', times=times)
+    folder = write_sequence(tmp_path / 'kitti', times=times)
+    if times is None:
+        (folder / 'labels/000003.label').write_bytes(b'0' * 8)
     assert convert(tmp_path / 'kitti', tmp_path / 'out.db3', '--sequence', '04', *words) == 2
     assert re.search(message, cli_runner.error_line(capsys))
-    assert [path.name for path in tmp_path.iterdir()] == ['kitti']
-
-
-def test_damaged_file_leaves_nothing(tmp_path, capsys):
-    folder = write_sequence(tmp_path / 'kitti')
-    (folder / 'labels/000003.label').write_bytes(b'0' * 8)
-    assert convert(tmp_path / 'kitti', '--sequence', '04', tmp_path / 'out') == 2
-    assert '000003.label: 8 bytes, expected 7204' in cli_runner.error_line(capsys)
     assert [path.name for path in tmp_path.iterdir()] == ['kitti']

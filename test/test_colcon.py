@@ -61,20 +61,16 @@ def workspace(tmp_path_factory):
     return folder
 
 
-def python_in(folder, script):
-    done = run(sourced(folder, f'{sys.executable} -c "$0"', script), folder, **ISOLATION)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
-
-
 def test_the_package_is_in_the_index_and_imported_from_the_workspace(workspace):
-    prefix = python_in(
-        workspace,
-        f'from ament_index_python import get_package_prefix as find; print(find("{PACKAGE}"))',
+    script = (
+        f'from ament_index_python import get_package_prefix as find; import {PACKAGE}; '
+        f'print(find("{PACKAGE}"), {PACKAGE}.__file__)'
     )
-    assert Path(prefix) == workspace / 'install' / PACKAGE
-    module = python_in(workspace, f'import {PACKAGE}; print({PACKAGE}.__file__)')
-    assert Path(prefix) in Path(module).parents
+    command = sourced(workspace, f'{sys.executable} -c "$0"', script)
+    done = run(command, workspace, **ISOLATION)
+    assert done.returncode == 0, done.stderr
+    prefix, module = map(Path, done.stdout.split())
+    assert prefix == workspace / 'install' / PACKAGE and prefix in module.parents
     installed = Path(prefix, 'share', PACKAGE)
     assert (installed / 'package.xml').read_bytes() == (REPOSITORY / 'package.xml').read_bytes()
     shared = [*REPOSITORY.glob('config/*'), *REPOSITORY.glob('launch/*.launch.py')]
@@ -88,8 +84,10 @@ def test_the_installed_node_runs_as_ros2_run_starts_it(workspace, tmp_path):
     prefix = workspace / 'install' / PACKAGE
     executable = prefix / 'lib' / PACKAGE / EXECUTABLE
     assert os.access(executable, os.X_OK)
-    for other in ('gp-ground-seg', 'ground_segmentation_lifecycle_node'):
-        assert os.access(executable.with_name(other), os.X_OK)
+    script = (REPOSITORY / 'scripts' / 'setup_workspace.sh').read_text()
+    (warm_up,) = re.findall(r'(install/\S+/gp-ground-seg) warm-up', script)
+    for other in executable.with_name('ground_segmentation_lifecycle_node'), workspace / warm_up:
+        assert os.access(other, os.X_OK)
     words = [
         '--ros-args', '-r', f'__ns:={NAMESPACE}', '-p', 'learning.mode:=fixed',
         '--params-file', prefix / 'share' / PACKAGE / 'config' / 'paper.yaml',
@@ -102,12 +100,6 @@ def test_the_installed_node_runs_as_ros2_run_starts_it(workspace, tmp_path):
         code, _ = node.stop(signal.SIGINT)
     assert code == 0, node.log
     assert 'Traceback' not in node.log
-
-
-def test_the_script_for_workspaces_runs_what_colcon_installs(workspace):
-    script = (REPOSITORY / 'scripts' / 'setup_workspace.sh').read_text()
-    (command,) = re.findall(r'(install/\S+/gp-ground-seg) warm-up', script)
-    assert os.access(workspace / command, os.X_OK)
 
 
 def test_colcon_test_collects_our_tests(workspace):

@@ -100,9 +100,7 @@ def test_given_tilt_levels_and_leaves_the_points_as_they_are():
         cloud = model.wait(1)[0]
         if not HAS_TF2:
             # Asked for live it is refused, and the node goes on.
-            result = b.set('frame.level', 'tf')
-            assert not result.successful
-            assert 'needs tf2_ros' in result.reason
+            assert 'needs tf2_ros' in b.refusal('frame.level', 'tf')
             assert b.node.config.frame.level == 'sensor'
             assert not b.set('frame.base', 'two words').successful
             assert b.set('frame.base', 'base_footprint').successful

@@ -120,7 +120,7 @@ def test_impossible_transitions_are_refused_at_once(tmp_path):
     possible = {unconfigured: (1, 5), inactive: (3, 2, 6), active: (7, 4), finalized: ()}
     with managed_node(tmp_path, NUMBA_DISABLE_JIT='1') as (process, link):
         for state, numbers in possible.items():
-            for number in {*range(12), *range(60, 70), 99, 255}.difference(numbers):
+            for number in {*range(9), 10, 60, 61, 255}.difference(numbers):
                 start = time.monotonic()
                 assert change(link, number) == (False, state), (state, number)
                 assert time.monotonic() - start < 5.0

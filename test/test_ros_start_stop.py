@@ -91,18 +91,11 @@ def test_bad_domain(monkeypatch, capfd, domain, hint):
     assert hint in ros.start_error(capfd)
 
 
-@pytest.mark.parametrize(
-    ('words', 'complaint'),
-    [
-        ('config dump --ros-args -p a:=1', '--ros-args: this command takes none'),
-        ('node nonsense', 'nonsense'),
-        ('node --ros-args -- nonsense', 'nonsense'),
-    ],
-)
-def test_words_that_nobody_takes_are_refused(capsys, words, complaint):
+@pytest.mark.parametrize('words', ['node nonsense', 'node --ros-args -- nonsense'])
+def test_words_that_nobody_takes_are_refused(capsys, words):
     with ros.isolated(), pytest.raises(SystemExit, match='2'):
         sys.exit(cli_runner.run(*words.split()))
-    assert complaint in capsys.readouterr().err
+    assert 'nonsense' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('given', [{}, {'HOME': '/proc'}, {'ROS_LOG_DIR': '/proc'}])
