@@ -29,8 +29,6 @@ from gp_ground_seg.lab.simulation import (
     simulate_scan,
 )
 
-SMALL = ['--set', 'grid.n_bins=40']
-
 
 @pytest.fixture(scope='module')
 def root(tmp_path_factory):
@@ -48,33 +46,26 @@ def few_places(monkeypatch):
 
 
 CASES = {
-    'ablation': (['ROOT', '--frame-step', '2', *SMALL], 'models', 8 * 3),
-    'ablation --simulated': (['--seeds', '1', *SMALL], 'pairs', 8),
-    'steps': (['ROOT', '--frame-step', '3'], 'steps', 9 * 2),
-    'pseudo-inputs': (['ROOT', '--frame-step', '3', *SMALL], 'pseudo_inputs', 7 * 2),
-    'scenes': (
-        ['--sensors', 'vlp-16,os1-128', '--scenes', 'flat,slope', '--seeds', '1'],
-        'scenes', 2 * 4,
-    ),
-    'scenes --sensors': (['vlp-16', '--scenes', 'low_boxes,flat', '--seeds', '1'], 'low', 2 * 2),
-    'scenes --scenes': (
-        ['flat,bank,ramp', '--sensors', 'vlp-16,mid-360', '--seeds', '1'],
-        'rough', 2 * (2 + 2 * 3),
-    ),
-    'scenes --no-peer': (['--sensors', 'vlp-16', '--scenes', 'kerb', '--seeds', '1'], 'scenes', 1),
-    'objects': (
-        ['--sensors', 'vlp-16', '--scenes', 'hidden_climb,hedge', '--seeds', '1'], 'vehicles', 4,
-    ),
-    'table1': (['ROOT'], 'errors', 2 * 3),
-    'speed': (['ROOT', '--frame-step', '3', *SMALL], 'times', 2 * 5 * 3),
-    'table1 --preset': (['paper', 'ROOT', '--set', 'learning.max_evaluations=4'], 'errors', 2 * 3),
-}  # fmt: skip
+    'ablation ROOT --frame-step 2 --set grid.n_bins=40': ('models', 8 * 3),
+    'ablation --simulated --seeds 1 --set grid.n_bins=40': ('pairs', 8),
+    'steps ROOT --frame-step 3': ('steps', 9 * 2),
+    'pseudo-inputs ROOT --frame-step 3 --set grid.n_bins=40': ('pseudo_inputs', 7 * 2),
+    'scenes --sensors vlp-16,os1-128 --scenes flat,slope --seeds 1': ('scenes', 2 * 4),
+    'scenes --sensors vlp-16 --scenes low_boxes,flat --seeds 1': ('low', 2 * 2),
+    'scenes --scenes flat,bank,ramp --sensors vlp-16,mid-360 --seeds 1': ('rough', 2 * 8),
+    'scenes --no-peer --sensors vlp-16 --scenes kerb --seeds 1': ('scenes', 1),
+    'objects --sensors vlp-16 --scenes hidden_climb,hedge --seeds 1': ('vehicles', 4),
+    'table1 ROOT': ('errors', 2 * 3),
+    'table1 --preset paper ROOT --set learning.max_evaluations=4': ('errors', 2 * 3),
+    'speed ROOT --frame-step 3 --set grid.n_bins=40': ('times', 2 * 5 * 3),
+}
+"""Words of the command, one of its tables, and the number of all rows."""
 
 
 @pytest.mark.parametrize('case', CASES)
 def test_record_terminal_and_markdown_say_the_same(case, root, tmp_path, capsys):
-    words, name, n_rows = CASES[case]
-    words = ['experiment', *case.split(), *(root if word == 'ROOT' else word for word in words)]
+    name, n_rows = CASES[case]
+    words = ['experiment', *(root if word == 'ROOT' else word for word in case.split())]
     assert run(*words, '--json', tmp_path / 'a.json') == 0
     lines = capsys.readouterr().out.splitlines()
     document = json.loads((tmp_path / 'a.json').read_text())
@@ -97,11 +88,10 @@ def test_record_terminal_and_markdown_say_the_same(case, root, tmp_path, capsys)
 @pytest.mark.parametrize(
     ('words', 'sensors', 'scenes', 'n_seeds'),
     [
-        (['scenes', '--sensors', 'mid-360,hdl-64e'], ['mid-360', 'hdl-64e'],
-         {*DRIVES, *LOW, *STEEP}, 3),
-        (['scenes', '--seeds', '2', '--scenes', 'flat,kerb'], THREE, ['flat', 'kerb'], 2),
+        ('--sensors mid-360,hdl-64e', ['mid-360', 'hdl-64e'], {*DRIVES, *LOW, *STEEP}, 3),
+        ('--seeds 2 --scenes flat,kerb', THREE, ['flat', 'kerb'], 2),
     ],
-)  # fmt: skip
+)
 def test_scans_and_parameters_are_those_of_the_options(
     words, sensors, scenes, n_seeds, monkeypatch, capsys
 ):
@@ -112,8 +102,8 @@ def test_scans_and_parameters_are_those_of_the_options(
         found.append((frames, config))
         raise DataError('enough')
 
-    monkeypatch.setitem(EXPERIMENTS, words[0], EXPERIMENTS[words[0]]._replace(run=note))
-    assert run('experiment', *words, *SMALL) == 2
+    monkeypatch.setitem(EXPERIMENTS, 'scenes', EXPERIMENTS['scenes']._replace(run=note))
+    assert run('experiment', 'scenes', *words.split(), '--set', 'grid.n_bins=40') == 2
     assert error_line(capsys) == 'enough'
     ((frames, config),) = found
     assert config == Config().replace(**{'grid.n_bins': 40})
@@ -125,31 +115,31 @@ def test_scans_and_parameters_are_those_of_the_options(
 @pytest.mark.parametrize(
     ('words', 'message'),
     [
-        (['ablation'], 'either ROOT or --simulated'),
-        (['ablation', 'ROOT', '--simulated'], 'either ROOT or --simulated'),
-        (['ablation', 'ROOT', '--seeds', '2'], '--seeds: is for --simulated only'),
-        (['ablation', '--simulated', '--sequences', '00'], '--sequences: is for labelled frames'),
-        (['ablation', '--simulated', '--frame-step', '2'], '--frame-step: is for labelled frames'),
-        (['ablation', 'ROOT', '--sequences', '07'], 'no sequence 07; sequences here: 00, 08'),
-        (['ablation', 'ROOT', '--set', 'learning.mode=fixed'], 'leave it out'),
-        (['steps', 'ROOT', '--set', 'grid.n_bins=40'], 'give no parameters'),
-        (['steps', 'ROOT', '--preset', 'paper'], 'give no parameters'),
-        (['ablation', '--simulated', '--set', 'length_scale.model=latent2'], 'length_scale.model'),
-        (['ablation', 'ROOT', '--scenes', 'flat'], '--scenes: is for --simulated only'),
-        (['ablation', 'ROOT', '--sensors', 'vlp-16'], '--sensors: is for --simulated only'),
-        (['scenes', '--preset', 'papr'], 'did you mean paper?'),
-        (['scenes', '--sensors', 'vlp-32'], 'must be some of hdl-64e'),
-        (['scenes', '--scenes', 'flat,flat'], 'each once'),
-        (['ablation', '--seeds', '0'], 'at least 1'),
-        (['table1'], 'ROOT'),
-        (['table1', 'ROOT', '--sequences', '08'], 'no frame 000000 in sequence 00'),
-        (['table1', 'ROOT', '--set', 'grid.n_segments=4'], 'segment 4: must be in [0, 3]'),
-        (['table1', 'ROOT', '--set', 'length_scale.model=constant'], 'leave it out'),
-        (['table1', 'ROOT', '--set', 'learning.mode=fixed'], 'leave it out'),
-        ([], 'NAME'),
-        (['moon'], 'moon'),
-        *(([name, '--json', 'MINE', *(['ROOT'] if name not in ('scenes', 'objects') else [])],
-           '--force') for name in EXPERIMENTS),
+        ('ablation', 'either ROOT or --simulated'),
+        ('ablation ROOT --simulated', 'either ROOT or --simulated'),
+        ('ablation ROOT --seeds 2', '--seeds: is for --simulated only'),
+        ('ablation --simulated --sequences 00', '--sequences: is for labelled frames'),
+        ('ablation --simulated --frame-step 2', '--frame-step: is for labelled frames'),
+        ('ablation ROOT --sequences 07', 'no sequence 07; sequences here: 00, 08'),
+        ('ablation ROOT --set learning.mode=fixed', 'leave it out'),
+        ('steps ROOT --set grid.n_bins=40', 'give no parameters'),
+        ('steps ROOT --preset paper', 'give no parameters'),
+        ('ablation --simulated --set length_scale.model=latent2', 'length_scale.model'),
+        ('ablation ROOT --scenes flat', '--scenes: is for --simulated only'),
+        ('ablation ROOT --sensors vlp-16', '--sensors: is for --simulated only'),
+        ('scenes --preset papr', 'did you mean paper?'),
+        ('scenes --sensors vlp-32', 'must be some of hdl-64e'),
+        ('scenes --scenes flat,flat', 'each once'),
+        ('ablation --seeds 0', 'at least 1'),
+        ('table1', 'ROOT'),
+        ('table1 ROOT --sequences 08', 'no frame 000000 in sequence 00'),
+        ('table1 ROOT --set grid.n_segments=4', 'segment 4: must be in [0, 3]'),
+        ('table1 ROOT --set length_scale.model=constant', 'leave it out'),
+        ('table1 ROOT --set learning.mode=fixed', 'leave it out'),
+        ('', 'NAME'),
+        ('moon', 'moon'),
+        *((f'{name} --json MINE' + ' ROOT' * (name not in ('scenes', 'objects')), '--force')
+          for name in EXPERIMENTS),
     ],
 )  # fmt: skip
 def test_errors_are_said_before_any_frame_is_read(
@@ -159,7 +149,7 @@ def test_errors_are_said_before_any_frame_is_read(
     target = tmp_path / 'mine'
     target.write_text('mine')
     named = {'ROOT': root, 'MINE': target}
-    assert run('experiment', *(named.get(word, word) for word in words)) == 2
+    assert run('experiment', *(named.get(word, word) for word in words.split())) == 2
     assert message in error_line(capsys)
     assert target.read_text() == 'mine'
 
