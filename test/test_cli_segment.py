@@ -16,11 +16,13 @@ from cli_runner import error_line, run, start, wait_for
 from evaluation_samples import label_files
 
 from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.cli.segment import _pose_summary
 from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.data.bags import BagReader, BagWriter
 from gp_ground_seg.data.clouds import gather, name_columns
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
+from gp_ground_seg.lab.scale.dataset import Outcome
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 
 SUMMARY = re.compile(
@@ -353,39 +355,23 @@ def write_scan(path, height, roll=0.0, pitch=0.0, turn=(0.0, 0.0)):
     path.write_bytes(points.astype('<f4').tobytes())
 
 
-def pose_line(capsys):
-    """Median and standard deviation of each parameter, and how many frames show it."""
-    _, line, *rest = capsys.readouterr().out.splitlines()
-    found = re.findall(r'sensor\.(\w+)=(\S+)(?: \(std (\S+)\))? (?:m|rad)', line)
-    n_frames = int(re.match(r'measured in (\d+) frame', line)[1])
-    return n_frames, {name: (float(x), float(std or 'nan')) for name, x, std in found}, rest
-
-
-def test_the_summary_has_height_and_tilt_of_the_sensor(tmp_path, capsys):
-    tilts = ((0.0, 0.0), (5.0, -4.0), (5.0, -4.0))
-    for name, (roll, pitch) in zip('abc', tilts, strict=True):
-        path = tmp_path / f'{name}.bin'
-        write_scan(path, 1.2, roll=math.radians(roll), pitch=math.radians(pitch))
-    assert segment(tmp_path, '-o', tmp_path / 'labels') == 0
-    n_frames, found, rest = pose_line(capsys)
-    assert (n_frames, rest) == (3, [])
-    assert found['height'] == pytest.approx((1.2, 0.01), abs=0.03)
-    for name, median in (('roll', math.radians(5.0)), ('pitch', math.radians(-4.0))):
-        # Of the values 0, m and m the standard deviation is |m| / sqrt(3).
-        assert found[name] == pytest.approx((median, abs(median) / 3.0**0.5), abs=0.003)
-    assert segment(tmp_path / 'b.bin', '-o', tmp_path / 'b.label') == 0
-    _, found, _ = pose_line(capsys)
-    assert np.isnan(found['roll'][1])
-
-
-def test_the_summary_says_which_parameter_the_scans_contradict(tmp_path, capsys):
-    write_scan(tmp_path / 'a.bin', 1.2)
+def test_the_summary_has_height_and_tilt_of_the_sensor_and_what_they_contradict(tmp_path, capsys):
+    tilt = math.radians(5.0), math.radians(-4.0)
+    write_scan(tmp_path / 'a.bin', 1.2, *tilt)
     words = ['-o', tmp_path / 'a.label', '--set', 'sensor.height=2.5']
     assert segment(tmp_path / 'a.bin', *words) == 0
-    _, found, (line,) = pose_line(capsys)
-    assert found['height'][0] == pytest.approx(1.2, abs=0.03)
-    assert line.startswith('sensor.height = 2.5: the ground near the sensor is 1.2')
-    assert line.endswith('(1 frame: docs/pose.md)')
+    _, line, contradiction = capsys.readouterr().out.splitlines()
+    assert line.startswith('measured in 1 frame: ')
+    height, *angles = map(float, re.findall(r'sensor\.\w+=(\S+) (?:m|rad)', line))
+    assert height == pytest.approx(1.2, abs=0.03)
+    assert angles == pytest.approx(tilt, abs=0.003)
+    assert contradiction.startswith('sensor.height = 2.5: the ground near the sensor is 1.2')
+    assert contradiction.endswith('(1 frame: docs/pose.md)')
+    tilts = [(0.0, 0.0), (0.1, -0.2), (0.1, -0.2)]
+    assert _pose_summary(Outcome(9, 3, 3 * [0.001], [1.2, 1.1, 1.3], tilts, [], {})) == (
+        'measured in 3 frames: sensor.height=1.20 (std 0.10) m, '
+        'sensor.roll=0.100 (std 0.058) rad, sensor.pitch=-0.200 (std 0.115) rad'
+    )
 
 
 def test_segment_names_the_scan_that_it_refuses(tmp_path, capsys):

@@ -53,6 +53,24 @@ def test_package_xml_is_that_of_this_package(package):
     assert launched <= depends | {'pathlib', 'yaml', PACKAGE}
 
 
+# The order that the schema of format 3 (REP 149) asks for.
+DEPENDENCIES = '(?:(?:build|build_export|buildtool|buildtool_export|exec|doc|test)_depend|depend)'
+IN_ORDER = re.compile(
+    'name version description (?:maintainer )+(?:license )+(?:url )*(?:author )*'
+    f'(?:{DEPENDENCIES} )*(?:group_depend )*(?:member_of_group )*(?:export )?'
+)
+
+
+def test_package_xml_follows_its_schema(package):
+    assert IN_ORDER.fullmatch(''.join(f'{element.tag} ' for element in package))
+    for element in package:
+        # A token: no space around it, none doubled, no line break.
+        if not len(element):
+            assert element.text == ' '.join(element.text.split())
+    names = [element.text for element in package if 'depend' in element.tag]
+    assert len(set(names)) == len(names)
+
+
 def test_one_version(package):
     """Of the newest section of the changelog as well, unless that is of the next release."""
     version = gp_ground_seg.__version__
