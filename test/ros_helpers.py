@@ -168,7 +168,6 @@ def rows_of(message):
 ENTRY_POINT = ('-c', 'import sys; from gp_ground_seg.cli.node import main; sys.exit(main())')
 """What the installed executable does."""
 MODULE = ('-m', 'gp_ground_seg', 'node')
-PLAY = ('-m', 'gp_ground_seg', 'play')
 IN_NAMESPACE = ('--ros-args', '-r', f'__ns:={NAMESPACE}')
 
 
@@ -359,9 +358,11 @@ class Bench(Link):
     def changed(self, values):
         """Other values of parameters within the block."""
         before = {name: self.node.config[name] for name in values}
-        assert all(result.successful for result in self.load(values))
-        yield
-        assert all(result.successful for result in self.load(before))
+        try:
+            assert all(result.successful for result in self.load(values))
+            yield
+        finally:
+            self.load(before)
 
     def in_executor(self, function, *arguments):
         """Result of a call made between two waits, where entities may safely go."""

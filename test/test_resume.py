@@ -50,9 +50,6 @@ def test_several_bags_become_one_each(tmp_path, capsys):
     write_ros2_bag(bags[1], n_clouds=4)
     assert run(*command) == 0
     assert capsys.readouterr().out.startswith('1 of 2 were finished before\n4 frames, ')
-    file = write_streets(tmp_path, s00=1) / 'sequences/00/velodyne/000000.bin'
-    assert run('segment', bags[0], file, '-o', tmp_path / 'out2') == 2
-    assert 'is no bag' in error_line(capsys)
 
 
 def test_what_is_there_is_kept_and_other_parameters_are_refused(root, tmp_path, capsys):
