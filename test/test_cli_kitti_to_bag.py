@@ -21,11 +21,11 @@ TIMES = [0.0, 0.1036219, 0.2072, 0.311, 0.415]
 convert = functools.partial(cli_runner.run, 'kitti-to-bag')
 
 
-def write_sequence(root, n_scans=5, n_labelled=5, times=TIMES):
+def write_sequence(root, n_labelled=5, times=TIMES):
     folder = root / 'sequences' / '04'
     (folder / 'velodyne').mkdir(parents=True)
     (folder / 'labels').mkdir()
-    for k in range(n_scans):
+    for k in range(5):
         scan = samples.scan(k)
         scan.tofile(folder / 'velodyne' / f'{k:06d}.bin')
         if k < n_labelled:
@@ -83,14 +83,9 @@ def test_scans_without_labels_have_no_label_field(tmp_path, capsys):
         assert cloud.data.reshape(1801, -1)[:, :16].tobytes() == samples.scan(k).tobytes()
 
 
-def test_all_by_force_at_ten_hertz(tmp_path, capsys):
-    folder = write_sequence(tmp_path)
+def test_without_times_the_bag_has_ten_hertz(tmp_path):
+    write_sequence(tmp_path, times=None)
     assert convert(tmp_path, '--sequence', '04', tmp_path / 'out') == 0
-    (folder / 'times.txt').unlink()
-    capsys.readouterr()
-    assert convert(tmp_path, '--sequence', '04', tmp_path / 'out') == 2
-    assert 'out: exists already; --force replaces it' in cli_runner.error_line(capsys)
-    assert convert(tmp_path, '--sequence', '04', tmp_path / 'out', '--force') == 0
     recorded = [time - EPOCH * 10**9 for time, _ in read_clouds(tmp_path / 'out')]
     assert recorded == [0, 100_000_000, 200_000_000, 300_000_000, 400_000_000]
 
