@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 import ros_helpers as ros
+from cli_runner import children
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from ros_helpers import street, to_message, wait_for
@@ -143,6 +144,6 @@ def test_a_signal_ends_the_wait_for_compiled_code(tmp_path):
         client.call_async(
             ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
         )
-        process.wait_until_ready('compiling for this processor')
+        wait_for(lambda: children(process.popen.pid), 'compiler')
         code, seconds = process.stop(signal.SIGTERM)
         assert code == 0 and seconds < 10.0
