@@ -9,20 +9,20 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+import ros_helpers as ros
 from bag_samples import PERIOD, START, write_ros1_bag, write_ros2_bag
 from cli_runner import error_line, run
-
-pytest.importorskip('rclpy', reason='ROS is not installed')
-
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_helpers import BEST_EFFORT, ISOLATION, PATIENCE, isolated_context, spinning, wait_for
+from ros_helpers import isolated_context, spinning, wait_for
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
+from gp_ground_seg.cli import options
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
 from gp_ground_seg.ros import playback, start_stop
@@ -152,7 +152,7 @@ def test_which_topics(tmp_path, capsys):
 def test_bag_of_ros_1_on_another_topic_for_a_best_effort_subscriber(tmp_path, capsys):
     bag = tmp_path / 'kitti.bag'
     write_ros1_bag(bag, 2)
-    with listening('/points', qos=BEST_EFFORT) as listener:
+    with listening('/points', qos=ros.BEST_EFFORT) as listener:
         remap = '/kitti/velo/pointcloud:=/points'
         sent = recorded(bag, '/kitti/velo/pointcloud')
         # DDS may lose a cloud for a best-effort subscriber; in one of two plays it does not.
@@ -177,7 +177,7 @@ def test_nobody_listens(tmp_path, capsys):
 def program(*words, code=('-m', 'gp_ground_seg', 'play')):
     """The command in a process of its own."""
     with subprocess.Popen(
-        [sys.executable, *code, *map(str, words)], env={**os.environ, **ISOLATION}, text=True,
+        [sys.executable, *code, *map(str, words)], env={**os.environ, **ros.ISOLATION}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     ) as process:  # fmt: skip
         try:
@@ -186,13 +186,15 @@ def program(*words, code=('-m', 'gp_ground_seg', 'play')):
             process.kill()
 
 
-def test_waits_and_says_so(tmp_path):
-    with program(drive(tmp_path, 2)) as process:
-        while process.stderr.readline() != f'{WAITING}\n':
-            assert process.poll() is None
+def test_waits_and_says_so(tmp_path, monkeypatch):
+    notes = []
+    monkeypatch.setattr(options, 'note', notes.append)
+    with ros.isolated(), ThreadPoolExecutor(1) as pool:
+        played = pool.submit(play, drive(tmp_path, 2))
+        wait_for(lambda: 'waiting for a subscriber of /points' in notes, 'note')
         with listening('/points') as listener:
             wait_for(lambda: len(listener.clouds['/points']) == 2, 'last cloud')
-            assert process.wait(PATIENCE) == 0
+            assert played.result(ros.PATIENCE) == 0
 
 
 def test_loop_until_interrupted(tmp_path):
@@ -203,7 +205,7 @@ def test_loop_until_interrupted(tmp_path):
     ):
         wait_for(lambda: len(listener.clouds['/points']) >= 7, 'third round')
         process.send_signal(signal.SIGINT)
-        output, errors = process.communicate(timeout=PATIENCE)
+        output, errors = process.communicate(timeout=ros.PATIENCE)
         wait_for(lambda: listener.subscriptions[0].get_publisher_count() == 0, 'farewell')
     assert process.returncode == 130
     assert errors.splitlines()[-1] == 'gp-ground-seg: interrupted'
@@ -250,7 +252,7 @@ def test_subscriber_that_is_killed(tmp_path, capsys, monkeypatch):
     with program(code=('-c', SUBSCRIBER)) as subscriber, isolated_context():
         assert play(bag) == 1
         assert time.monotonic() - sent[-1] > 0.5
-        assert subscriber.wait(PATIENCE) == -signal.SIGKILL
+        assert subscriber.wait(ros.PATIENCE) == -signal.SIGKILL
     said = capsys.readouterr().err.splitlines()[-1]
     assert said.endswith('not every reliable subscriber has acknowledged all clouds')
 
