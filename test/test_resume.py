@@ -1,5 +1,6 @@
 """Data sets that are segmented block by block: what is kept, and what is done again."""
 
+import fcntl
 import json
 import os
 import shutil
@@ -15,8 +16,6 @@ from evaluation_samples import label_files, write_streets, write_two_drives
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data import files
-
-N_FRAMES = 600  # of the long sequence
 
 
 @pytest.fixture(scope='module')
@@ -190,76 +189,52 @@ def test_a_record_that_is_none(line, root, tmp_path, capsys):
     assert run('segment', root, '-o', tmp_path, '--force') == 0
 
 
-@pytest.fixture(scope='module')
-def long_root(tmp_path_factory):
-    """A sequence of many frames, of few files."""
-    folder = write_streets(tmp_path_factory.mktemp('long'), s00=2)
-    scans = folder / 'sequences/00/velodyne'
-    for k in range(2, N_FRAMES):
-        (scans / f'{k:06d}.bin').hardlink_to(scans / f'{k % 2:06d}.bin')
-    return folder
-
-
-def wait_for_lines(process, manifest, n):
-    def is_there():
-        assert process.poll() is None
-        return manifest.exists() and manifest.read_bytes().count(b'\n') >= n
-
-    wait_for(is_there, f'{n} lines')
-
-
-def assert_gone(pids):
-    wait_for(lambda: not any(map(is_running, pids)), 'end of all processes')
-
-
-@pytest.mark.slow
-def test_killed_worker_and_client_lose_nothing_and_nothing_is_done_twice(
-    long_root, tmp_path, capsys
-):
-    out, command = tmp_path / 'out', ['segment', long_root, '-o', tmp_path / 'out']
-    process = start(*command, '--workers', '2')
-    # The first line is of what is to be written.
-    wait_for_lines(process, out / 'outputs.jsonl', 2)
-    workers = children(process.pid)
-    os.kill(workers[-1], signal.SIGKILL)
-    wait_for_lines(process, out / 'outputs.jsonl', 5)
-    workers += children(process.pid)
-    for more in ('--force', '--quiet'):
-        assert run(*command, more) == 2
-        assert error_line(capsys) == f'{out}: another run writes to it'
-    process.kill()
-    _, err = process.communicate()
-    assert 'a worker died; computed again: ' in err and 'Traceback' not in err
-    assert_gone(workers)
-    before = finished(out)
-    assert 0 < len(before) < N_FRAMES
-    times = {name: (out / name).stat().st_mtime_ns for name in before}
-    with (out / 'outputs.jsonl').open('a') as file:
-        file.write('{"written": {"na')  # as a line that was being written
-    (out / 'sequences/00/predictions/.000999.label.partial-0').touch()
+def test_a_run_that_was_killed_goes_on_and_nothing_is_done_twice(root, tmp_path, capsys):
+    out = tmp_path / 'out'
+    command, record = ['segment', root, '-o', out], out / 'outputs.jsonl'
     assert run(*command) == 0
-    assert f'{len(before)} of {N_FRAMES} were finished before' in capsys.readouterr().out
-    assert sorted(finished(out)) == [
-        f'sequences/00/predictions/{k:06d}.label' for k in range(N_FRAMES)
-    ]
+    whole = label_files(out)
+    planned, first, *_ = record.read_bytes().splitlines(keepends=True)
+    # It was writing a line, and a file.
+    record.write_bytes(planned + first + b'{"written": {"na')
+    (out / 'sequences/00/predictions/.000999.label.partial-0').touch()
+    before = [*json.loads(first)['written']]
+    assert 0 < len(before) < 12
+    times = {name: (out / name).stat().st_mtime_ns for name in before}
+    capsys.readouterr()
+    with record.open('rb') as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        for more in ('--force', '--quiet'):
+            assert run(*command, more) == 2
+            assert error_line(capsys) == f'{out}: another run writes to it'
+    assert run(*command) == 0
+    assert f'{len(before)} of 12 were finished before' in capsys.readouterr().out
+    assert sorted(finished(out)) == sorted(whole)
     assert {name: (out / name).stat().st_mtime_ns for name in before} == times
-    found = label_files(out)
-    assert len(found) == N_FRAMES == len(list((out / 'sequences/00/predictions').iterdir()))
-    assert len(set(found.values())) == 2
+    assert label_files(out) == whole
+    assert not [path for path in out.rglob('*') if 'partial' in path.name]
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_all_processes_with_one_line(long_root, tmp_path):
-    process = start(
-        'segment', long_root, '-o', tmp_path / 'out', '--workers', '2', start_new_session=True
-    )
-    wait_for_lines(process, tmp_path / 'out/outputs.jsonl', 2)
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
+def test_all_processes_end_with_a_run_that_is_stopped(tmp_path, number):
+    root, record = write_streets(tmp_path / 'root', s00=1), tmp_path / 'out/outputs.jsonl'
+    scan, *_ = root.rglob('*.bin')
+    for k in range(1, 600):
+        scan.with_name(f'{k:06d}.bin').hardlink_to(scan)
+    words = 'segment', root, '-o', record.parent, '--workers', '2'
+    process = start(*words, start_new_session=True)
+    # The first line is of what is to be written.
+    wait_for(lambda: record.exists() and record.read_bytes().count(b'\n') >= 2, 'two lines')
     workers = children(process.pid)
-    os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    assert (out, err) == ('', 'gp-ground-seg: interrupted\n')
-    assert process.returncode in INTERRUPTED
-    assert_gone(workers)
+    if number == signal.SIGINT:
+        os.killpg(process.pid, number)
+        assert process.communicate() == ('', 'gp-ground-seg: interrupted\n')
+        assert process.returncode in INTERRUPTED
+    else:
+        process.kill()
+        assert 'Traceback' not in process.communicate()[1]
+    wait_for(lambda: not any(map(is_running, workers)), 'end of all processes')
 
 
 def test_a_folder_of_that_name_is_kept(tmp_path):
