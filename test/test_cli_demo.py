@@ -22,7 +22,7 @@ from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
 from gp_ground_seg.ros import start_stop
-from gp_ground_seg.ros.node_process import NodeProcess, private_session
+from gp_ground_seg.ros.node_process import NodeProcess
 
 
 def sent_cloud(n=40, seed=0, stamp=5_000_000_007):
@@ -137,20 +137,6 @@ def test_a_node_that_ends_is_said_and_one_that_runs_ends_with_its_block(rclpy, t
     for text, is_settled in (('', 1), (FOLLOWS, 0), (FOLLOWS + CHANGED, 1), (FOLLOWS + STAYS, 1)):
         log.write_text(text)
         assert node.is_settled() == is_settled
-
-
-@pytest.mark.slow
-def test_the_node_imports_nothing_from_the_current_folder(rclpy, tmp_path, monkeypatch):
-    for name in ('numpy', 'yaml', 'rclpy', 'gp_ground_seg'):
-        (tmp_path / f'{name}.py').write_text(f'raise SystemExit({name!r})')
-    monkeypatch.chdir(tmp_path)
-    log = tmp_path / 'log'
-    with private_session('link') as (session, words), NodeProcess(log, words) as node:
-        wait_for(lambda: node.check() or 'listening to' in log.read_text(), 'start')
-        namespace = session.node.get_namespace()
-        assert f'listening to {namespace}/points' in log.read_text()
-    with private_session('link') as (session, _):
-        assert session.node.get_namespace() != namespace
 
 
 @pytest.fixture
