@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from bag_samples import scan, write_ros1_bag, write_ros2_bag
+from evaluation_samples import write_frame
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rclpy.serialization import serialize_message
 from ros_helpers import SETTERS, linked_process, street, to_message
@@ -31,6 +32,7 @@ from torture_fuzz import WORDS, fuzz, mutant, samples_of_readers
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.core.parameters.config import parameter_specs
+from gp_ground_seg.core.parameters.export import to_yaml
 from gp_ground_seg.core.pipeline.points import take_points
 
 TEST = Path(__file__).parent
@@ -221,24 +223,17 @@ def make_samples(folder):
     """Valid files: name -> (path of what is damaged, words of the command)."""
     points = scan()
     points.tofile(folder / 'scan.bin')
-    root = folder / 'root' / 'sequences' / '00'
-    (root / 'velodyne').mkdir(parents=True)
-    (root / 'labels').mkdir()
-    points.tofile(root / 'velodyne' / '000000.bin')
-    np.full(len(points), 40, '<u4').tofile(root / 'labels' / '000000.label')
-    with contextlib.redirect_stdout(io.StringIO()) as text:
-        assert cli.main(['config', 'dump']) == 0
-    (folder / 'robot.yaml').write_text(text.getvalue())
-    write_ros2_bag(folder / 'drive.mcap')
-    write_ros2_bag(folder / 'drive.db3')
+    write_frame(folder / 'root', '00', 0, points, np.full(len(points), 40, '<u4'))
+    robot, sequence = folder / 'robot.yaml', folder / 'root/sequences/00'
+    robot.write_text(to_yaml(Config()))
+    for name in ('drive.mcap', 'drive.db3', 'drive'):
+        write_ros2_bag(folder / name)
     write_ros1_bag(folder / 'drive.bag')
-    write_ros2_bag(folder / 'drive')
     out = ['-o', folder / 'out.mcap']
-    robot = folder / 'robot.yaml'
     samples = {
         'scan': (folder / 'scan.bin', ['segment', folder / 'scan.bin']),
-        'scan of a root': (root / 'velodyne' / '000000.bin', ['evaluate', folder / 'root']),
-        'labels': (root / 'labels' / '000000.label', ['evaluate', folder / 'root']),
+        'scan of a root': (sequence / 'velodyne/000000.bin', ['evaluate', folder / 'root']),
+        'labels': (sequence / 'labels/000000.label', ['evaluate', folder / 'root']),
         'parameters': (robot, ['config', 'check', robot]),
         'parameters used': (robot, ['segment', folder / 'scan.bin', '--config', robot]),
     }

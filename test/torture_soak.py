@@ -71,12 +71,9 @@ def main():
             for collector in (link.ground, link.obstacles, link.diagnostics):
                 collector.messages.clear()
         wrong = []
-        first, last = (
-            usage[0],
-            [statistics.median(column[-5:]) for column in zip(*usage, strict=True)],
-        )
-        if last[0] > (1.0 + MAX_GROWTH) * first[0]:
-            wrong.append(f'memory grew from {first[0] / 1e6:.1f} to {last[0] / 1e6:.1f} MB')
+        first, last = usage[0][0], [statistics.median(c[-5:]) for c in zip(*usage, strict=True)]
+        if last[0] > (1.0 + MAX_GROWTH) * first:
+            wrong.append(f'memory grew from {first / 1e6:.1f} to {last[0] / 1e6:.1f} MB')
         # How many threads there are depends on the settings of the moment.
         most = [max(column[:10]) for column in zip(*usage, strict=True)]
         if last[1] > most[1] or last[2] > most[2]:
