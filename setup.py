@@ -6,6 +6,8 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 PACKAGE = 'gp_ground_seg'
+# `colcon build --symlink-install` runs a link to this file, in a folder without README.md.
+README = Path(__file__).resolve().with_name('README.md')
 
 BAGS = ['mcap>=1.5', 'rosbags>=0.11.9']
 EVALUATE = ['pandas>=2.1']
@@ -57,7 +59,7 @@ setup(
     name=PACKAGE,
     version='0.4.0',  # a literal: catkin_prepare_release writes it here and into package.xml
     description='Ground segmentation of LiDAR scans with two coupled Gaussian processes',
-    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description=README.read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     license='Apache-2.0',
     url='https://example.org/gp_ground_seg',  # a placeholder, as in package.xml and README.md

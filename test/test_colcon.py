@@ -116,3 +116,9 @@ def test_colcon_test_collects_our_tests(workspace):
     done = colcon(workspace, 'test-result', '--test-result-base', str(workspace / 'build'))
     assert done.returncode == 0
     assert f'Summary: {suite.get("tests")} tests, 0 errors, 0 failures' in done.stdout
+
+
+def test_links_to_the_sources_are_installed_too(tmp_path):
+    built = colcon(tmp_path, 'build', '--symlink-install')
+    assert built.returncode == 0, built.stdout + built.stderr
+    assert os.access(tmp_path / 'install' / PACKAGE / 'lib' / PACKAGE / EXECUTABLE, os.X_OK)
