@@ -97,8 +97,9 @@ def test_a_lifecycle_manager_hears_a_bond_while_the_node_is_active(tmp_path):
             assert {one.id for one in heard.messages} == {NODE_NAME}
             instances.append({one.instance_id for one in heard.messages})
             times = [one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec for one in beats]
-            assert np.diff(times) == pytest.approx(1.0, abs=0.5)
-            assert end.heartbeat_period == 1.0 and end.heartbeat_timeout == 4.0
+            # Nav2's manager waits half of its bond_timeout for the first that it hears.
+            assert np.median(np.diff(times)) < 0.5
+            assert end.heartbeat_period == pytest.approx(0.1) and end.heartbeat_timeout == 4.0
         (first,), (second,) = instances
         assert first != second
         assert process.stop(signal.SIGINT)[0] == 0

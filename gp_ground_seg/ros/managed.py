@@ -19,7 +19,9 @@ from gp_ground_seg.ros import node
 from gp_ground_seg.ros.input import STEADY_CLOCK, THROTTLED
 from gp_ground_seg.ros.start_stop import StopRequest
 
-PERIOD = 1.0  # from one heartbeat to the next [s]
+# From one heartbeat to the next [s], as of Nav2's own nodes: the manager connects after the first,
+# and waits half of its bond_timeout for one.
+PERIOD = 0.1
 TIMEOUT = 4.0  # without one until the node is taken for dead [s]: the manager's own default
 DEPTH = 5
 LAST_WORDS = Duration(seconds=0.5)  # longest wait until the end of a bond is delivered
