@@ -119,6 +119,7 @@ def test_nav2_snippets_are_yaml_and_fit_the_command_and_the_messages():
     consistency = layers['ground_consistency_layer']
     assert f'-r ground:={consistency["ground_points_topic"]}' in text
     assert f'-r obstacles:={consistency["nonground_points_topic"]}' in text
+    assert layers['lifecycle_manager_lidar']['ros__parameters']['node_names'] == [NODE_NAME]
     given = dict(re.findall(r'-p ([\w.]+):=(\S+)', text))
     assert Config().replace(**{name: float(value) for name, value in given.items()})
 
