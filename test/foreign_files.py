@@ -477,6 +477,7 @@ CASES |= {
         THREE,
     ),
     'empty': (folder(lambda _: ''), NAMED),
+    'a_list': (folder(lambda _: '- 1'), NAMED),
     'cut': (folder(lambda text: text[:300]), NAMED),
     'cut_in_a_word': (folder(lambda text: text[: text.index('relative') + 4]), NAMED),
     'no_yaml': (folder(lambda _: 'a: ['), NAMED),

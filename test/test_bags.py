@@ -5,7 +5,6 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-from unittest.mock import Mock
 
 import bag_samples as samples
 import pytest
@@ -161,14 +160,9 @@ def test_what_is_no_bag_is_refused_in_one_line(tmp_path, name, content, message)
     assert re.match(f'{re.escape(str(tmp_path / name))}: {message}', problem_of(tmp_path / name))
 
 
-def test_bad_metadata(tmp_path):
+def test_a_folder_without_metadata_is_told_by_its_files(tmp_path):
     samples.write_ros2_bag(tmp_path / 'drive')
-    metadata = tmp_path / 'drive' / 'metadata.yaml'
-    for text in ('', 'a: [', 'rosbag2_bagfile_information: {version: 9}', '- 1'):
-        metadata.write_text(text)
-        said = problem_of(tmp_path / 'drive')
-        assert said.startswith(f'{metadata}: ') and 'ros2 bag reindex' in said
-    metadata.unlink()
+    (tmp_path / 'drive' / 'metadata.yaml').unlink()
     missing = r'no metadata\.yaml in it\).*one by one: drive\.mcap'
     assert re.search(missing, problem_of(tmp_path / 'drive'))
 
@@ -257,14 +251,6 @@ def test_a_bag_is_replaced_with_force_only_and_by_a_whole_one_only(tmp_path, nam
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
-@pytest.mark.parametrize('error', [OSError(28, 'No space left'), sqlite3.Error('disk full')])
-def test_a_full_disk_is_reported(tmp_path, monkeypatch, error):
-    monkeypatch.setattr('rosbags.rosbag2.Writer.write', Mock(side_effect=error))
-    with pytest.raises(DataError, match=r'a\.mcap: cannot be written: (No space|disk full)'):
-        samples.write_note(tmp_path / 'a.mcap', 1, 'text')
-    assert listing(tmp_path) == []
-
-
 def test_files_into_an_existing_folder_leave_the_others(tmp_path):
     (tmp_path / 'mine').write_text('kept')
     with staged_files(tmp_path, ['a', 'b'], force=False) as folder:
@@ -316,15 +302,12 @@ def test_impossible_output_is_refused(tmp_path, name, storage, message):
     assert listing(tmp_path) == []
 
 
-@pytest.mark.parametrize('name', ['a#1?.mcap', 'a [x]', 'ä ö'])
-def test_unusual_names_work(tmp_path, small_bags, name):
-    written = samples.write_ros2_bag(tmp_path / name)
-    assert read_all(tmp_path / name) == written
-    assert [p.name for p in tmp_path.iterdir()] == [name]
+def test_unusual_names_work(tmp_path, small_bags):
+    """Other names are in test_hostile_files.py; sqlite reads a # and a ? as part of a URL."""
     shutil.copy(small_bags / 'drive.db3', tmp_path / 'a#2?.db3')
     assert read_all(tmp_path / 'a#2?.db3') == read_all(small_bags / 'drive.db3')
-    (tmp_path / f'.{name}.partial-1').mkdir()
-    assert [p.name for p in leftovers(tmp_path / name)] == [f'.{name}.partial-1']
+    (tmp_path / '.a [x].partial-1').mkdir()
+    assert [p.name for p in leftovers(tmp_path / 'a [x]')] == ['.a [x].partial-1']
 
 
 def test_a_topic_is_declared_once_and_has_one_type(tmp_path):
