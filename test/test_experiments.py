@@ -4,22 +4,27 @@ import itertools
 
 import numpy as np
 import pytest
-from evaluation_samples import scores_of, write_streets
+from conftest import scene_of, simulated
+from evaluation_samples import write_streets
 
-from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.parameters.config import PRESETS
 from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab.experiments import ablation, scenes, variants
 from gp_ground_seg.lab.experiments.ablation import MODELS
+from gp_ground_seg.lab.experiments.variants import TOLD
 from gp_ground_seg.lab.scoring import evaluate as runner
+from gp_ground_seg.lab.scoring.evaluate import OURS
+from gp_ground_seg.lab.scoring.frames import make_scores
 from gp_ground_seg.lab.scoring.metrics import count_labels, height_sums, label_ratios
+from gp_ground_seg.lab.scoring.objects import CLASSES, count_objects
 from gp_ground_seg.lab.scoring.peers import (
     InterpolationMethod,
-    PatchworkppMethod,
     ground_points,
 )
-from gp_ground_seg.lab.simulation import SCENES, SENSORS, Kind, simulate_scan
+from gp_ground_seg.lab.simulation import Kind
+from gp_ground_seg.lab.simulation.objects import object_heights
 
 FIXED = Config().replace(**{'learning.mode': 'fixed'})
 
@@ -121,8 +126,41 @@ def test_scenes_without_a_free_lane_are_seen_from_the_origin_only():
     assert places == [('kerb', 0.0), ('kerb', 6.0), ('hedge', 0.0)]
 
 
-def test_lost_objects_follow_their_definitions(monkeypatch):
-    sensor, scene = 'vlp-16', 'hidden_climb'
+@pytest.mark.parametrize('scene', ['hidden_climb', 'traffic_jam', 'low_boxes', 'low_walls'])
+def test_objects_of_a_simulated_scan_are_those_that_its_rays_hit(scene):
+    """Vehicles, persons and cyclists by their kind; lower ones by the nearest of five heights."""
+    objects = variants.load_simulated(variants.SimulatedFrame('vlp-16', scene, 1, 0.0)).objects
+    made, solids = simulated(scene, seed=1), scene_of(scene, 1).solids
+    heights = object_heights(scene_of(scene, 1).terrain, solids)
+    names = {Kind.BOX: 'vehicle', Kind.PERSON: 'person', Kind.CYCLIST: 'cyclist'}
+    expected = [names.get(kind) if number else None
+                for kind, number in zip(made.kind, made.object_id, strict=True)]  # fmt: skip
+    for k in np.flatnonzero(heights[made.object_id] < 0.69):
+        expected[k] = f'low, {round(heights[made.object_id[k]] + 1e-6, 1):g} m'
+    assert [[*CLASSES, None][number] for number in objects.class_of] == expected
+    np.testing.assert_array_equal(objects.object_id, made.object_id)
+
+
+def test_scenes_are_scored_by_ours_with_and_without_the_height_and_by_the_peer():
+    frame = variants.SimulatedFrame('hdl-64e-vehicle', 'on_ramp', 0, 0.0)
+    report = scenes.score_scenes([frame], FIXED)
+    scan, peer = variants.load_simulated(frame), variants.peer_of(frame.sensor)
+    told = GroundSegmenter(FIXED.replace(**{'sensor.height': 0.0})).segment(scan.points)
+    peer.run(scan.points)
+    ours = GroundSegmenter(FIXED).segment(scan.points)
+    assert told.pose.height == 0.0 != ours.pose.height
+    row = report.tables['rough'].json()[0]
+    for who, result in (('', ours), ('told_', told), ('peer_', peer.result())):
+        error = (result.ground_z - scan.ground_z)[scan.is_ground]
+        assert row[f'{who}iou'] == iou_of(result.label, scan.truths['exact'])
+        assert row[f'{who}rmse'] == pytest.approx(np.sqrt(np.nanmean(error**2)))
+        lost = count_objects(scan.points, result.label, scan.objects)
+        assert row[f'{who}lost'] == sum(one['n_lost'] for one in lost)
+    (alone,) = scenes.score_scenes([frame], FIXED, with_peer=False).tables['rough'].json()[:1]
+    assert alone.items() <= row.items() and 'told_iou' in alone and 'peer_iou' not in alone
+
+
+def test_a_scene_that_is_refused_is_said(monkeypatch):
     score = variants.score_variants
 
     def refuse_hedges(frames, *rest):
@@ -131,133 +169,79 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
         return score(frames, *rest)
 
     monkeypatch.setattr(variants, 'score_variants', refuse_hedges)
-    frames = variants.simulated_frames([sensor], [scene, 'hedge'], 1, (0.0,))
-    report = scenes.score_objects(frames, FIXED)
-    (row,), (shares,) = (report.tables[name].json() for name in ('objects', 'vehicles'))
-    made = simulate_scan(SCENES[scene](0), SENSORS[sensor], np.random.default_rng(0))
-    x, y, z, _ = made.points.T.astype(float)
-    reach, high = np.hypot(x, y), z - made.ground_z >= 0.3
-    method = PatchworkppMethod(SENSORS[sensor].height)
-    method.run(made.points)
-    labels = {
-        '': GroundSegmenter(FIXED).segment(made.points).label,
-        'peer_': method.result().label,
-    }
-    for prefix, label in labels.items():
-        is_ground = label == Label.GROUND
-        truth = np.where(made.is_ground, Label.GROUND, Label.OBSTACLE)
-        assert row[f'{prefix}iou'] == iou_of(label, truth)
-        for title, kinds in (('vehicles', [Kind.BOX]), ('persons', [Kind.PERSON, Kind.CYCLIST])):
-            own = np.isin(made.kind, kinds) & high
-            parts = [own & (made.object_id == k) for k in range(1, made.object_id.max() + 1)]
-            parts = [part for part in parts if part.sum() >= 10]
-            assert row[title] == len(parts) > 0
-            n_lost = sum(is_ground[part].mean() > 0.5 for part in parts)
-            assert row[f'{prefix}lost_{title}'] == n_lost
-        own = (made.kind == Kind.BOX) & high
-        for title, low, far in (('0-10 m', 0, 10), ('10-20 m', 10, 20), ('> 20 m', 20, 1e9)):
-            band = own & (reach >= low) & (reach < far)
-            expected = is_ground[band].mean() if band.any() else None
-            assert shares[f'{prefix}{title}'] == pytest.approx(expected)
-    notes = report.tables['objects'].notes
-    assert notes[0] == 'refused: hedge: z does not point up'
-    assert notes[1].startswith(f'objects lost: {sensor} {scene} {row["lost_vehicles"]} of')
+    frames = variants.simulated_frames(['vlp-16'], ['hedge', 'low_boxes', 'ramp'], 1, (0.0,))
+    tables = scenes.score_scenes(frames, FIXED, with_peer=False).tables
+    assert tables['scenes'].notes[0] == 'refused: hedge: z does not point up'
+    names = {'scenes': ['low_boxes', 'ramp'], 'objects': ['ramp'], 'low': ['low_boxes']}
+    names['rough'] = ['ramp', 'all']
+    assert {key: [r['scene'] for r in tables[key].json()] for key in names} == names
     with pytest.raises(PointCloudError, match='refused: hedge'):
-        scenes.score_objects(frames[1:], FIXED, with_peer=False)
+        scenes.score_objects(frames[:1], FIXED, with_peer=False)
 
 
-def test_low_things_lost_follow_their_definitions():
-    """By plain loops over the returns of each object of two scenes, ours and the peer's."""
-    frames = variants.simulated_frames(['vlp-16'], ['low_boxes', 'low_walls', 'ramp'], 2, (0.0,))
-    report = scenes.score_scenes(frames, FIXED)
-    assert [row['scene'] for row in report.tables['objects'].json()] == ['ramp']
-    rows = report.tables['low'].json()
-    assert [row['scene'] for row in rows] == ['low_boxes', 'low_walls']
-    for row in rows:
-        lost = {}
-        for seed in range(2):
-            scene = SCENES[row['scene']](seed)
-            made = simulate_scan(scene, SENSORS['vlp-16'], np.random.default_rng(seed))
-            high = made.points[:, 2] - made.ground_z >= 0.1
-            method = PatchworkppMethod(0.8)
-            method.run(made.points)
-            labels = GroundSegmenter(FIXED).segment(made.points).label, method.result().label
-            for number, solid in enumerate(scene.solids, 1):
-                own = high & (made.object_id == number)
-                if own.sum() >= 3:
-                    height = f'{solid.top - float(scene.terrain.height(solid.x, solid.y)):.1f} m'
-                    found = [(label[own] == Label.GROUND).mean() > 0.5 for label in labels]
-                    lost.setdefault(height, []).append(found)
-        assert row['things'] == sum(map(len, lost.values())) >= 5
-        for height in ('0.2 m', '0.3 m', '0.4 m', '0.5 m', '0.6 m'):
-            expected = np.mean(lost[height], axis=0) if height in lost else (None, None)
-            assert (row[height], row[f'peer_{height}']) == pytest.approx(tuple(expected))
-    assert len(lost) == 2  # heights of walls
+def scored_by_hand():
+    """Ours and a peer on three scenes: errors of the height, and objects of two bands."""
 
+    def rows(method, *ious, error, lost):
+        height = height_sums(np.zeros(4), np.array([error, error, -3.0 * error, np.nan]))
+        scans, objects = [], []
+        for scene, iou in zip(('vlp-16 flat', 'vlp-16 ramp', 'os1 ramp'), ious, strict=True):
+            key = {'method': method, 'sequence': scene, 'index': ''}
+            scans.append({
+                **key, **height, 'cluster': scene, 'n_scans': 1, 'seconds': 0.0, 'points': 100,
+                'n_changed': 0, 'backend': 'numba', 'n_objects': 6, 'n_lost': lost,
+                'exact_tp': iou, 'exact_fp': 100 - iou, 'exact_fn': 0, 'exact_tn': 0,
+            })  # fmt: skip
+            for k, (name, band) in enumerate((
+                ('vehicle', '0-10 m'), ('vehicle', '20-40 m'), ('vehicle', '> 40 m'),
+                ('person', '0-10 m'), ('cyclist', '0-10 m'), ('low, 0.3 m', '0-10 m'),
+            )):  # fmt: skip
+                counts = {'n_returns': 50, 'n_ground': lost * k, 'n_objects': 2, 'n_unknown': 0}
+                objects.append({**key, 'class': name, 'range': band, **counts, 'n_lost': lost})
+        return {'scans': scans, 'objects': objects}
 
-def test_rough_ground_is_a_mean_over_the_sensors_of_ours_with_and_without_the_height():
-    sensors = {'vlp-16': 0.8, 'hdl-64e-vehicle': 0.0}
-    frames = variants.simulated_frames([*sensors], ['flat', 'on_ramp', 'ditch'], 1, (0.0,))
-    report = scenes.score_scenes(frames, FIXED)
-    assert [row['scene'] for row in report.tables['rough'].json()] == ['on_ramp', 'ditch', 'all']
-    found = {}
-    for scene, (sensor, height) in itertools.product(('on_ramp', 'ditch'), sensors.items()):
-        made = simulate_scan(SCENES[scene](0), SENSORS[sensor], np.random.default_rng(0))
-        ground = made.is_ground
-        truth = np.where(ground, Label.GROUND, Label.OBSTACLE)
-        told = GroundSegmenter(FIXED.replace(**{'sensor.height': height}))
-        peer = variants.peer_of(sensor)
-        peer.run(made.points)
-        results = {
-            '': GroundSegmenter(FIXED).segment(made.points),
-            'told_': told.segment(made.points),
-            'peer_': peer.result(),
-        }
-        assert results['told_'].pose.height == height
-        for who, result in results.items():
-            iou = iou_of(result.label, truth)
-            error = (result.ground_z - made.ground_z)[ground]
-            found.setdefault((scene, who), []).append((iou, np.sqrt(np.nanmean(error**2))))
-    rows = {row['scene']: row for row in report.tables['rough'].json()}
-    for (scene, who), values in found.items():
-        row = rows[scene]
-        expected = np.mean(values, axis=0)
-        assert [row[f'{who}iou'], row[f'{who}rmse']] == pytest.approx(expected, rel=1e-5)
-    for name, value in rows['all'].items():
-        own = [rows[scene][name] for scene in ('on_ramp', 'ditch')] if name != 'scene' else []
-        counted = name in ('scans', 'objects') or name.endswith('lost')
-        assert not own or value == pytest.approx(sum(own) if counted else np.mean(own))
-    assert rows['all']['scans'] == 4 and rows['all']['objects'] > 20
-
-    alone = scenes.score_scenes(frames, FIXED, with_peer=False).tables['rough'].json()
-    for row in alone:
-        assert row.items() <= rows[row['scene']].items() and 'told_iou' in row
-        assert not any(name.startswith('peer_') for name in row)
+    parts = rows(OURS, 90, 80, 70, error=0.1, lost=0), rows(TOLD, 90, 80, 90, error=0.1, lost=0)
+    return make_scores([*parts, rows('x', 89, 81, 70, error=0.2, lost=1)])
 
 
 def test_scenes_by_hand_and_behind_is_said():
-    """Scores are those of each scan as `test_lost_objects_follow_their_definitions` has them."""
-
-    def rows(*ious, error):
-        height = height_sums(np.zeros(4), np.array([error, error, -3.0 * error, np.nan]))
-        return [
-            {'sequence': f'vlp-16 {name}', 'index': '', **height,
-             'exact_tp': iou, 'exact_fp': 100 - iou, 'exact_fn': 0, 'exact_tn': 0}
-            for name, iou in zip(('flat', 'ramp', 'kerb'), ious, strict=True)
-        ]  # fmt: skip
-
-    scores = scores_of(y=rows(90, 80, 70, error=0.1), x=rows(89, 81, 70, error=0.2))
+    """Of each scan the counts are those of test_objects.py."""
+    every = scored_by_hand()
+    scores = every.of([OURS, 'x'])
     table = scenes.scene_table(scores)
     (note,) = table.notes
-    assert note == 'ahead of x on 1 of 3 rows; behind on vlp-16 ramp, vlp-16 kerb'
+    assert note == 'ahead of x on 1 of 3 rows; behind on vlp-16 ramp, os1 ramp'
     row = table.json()[0]
     assert (row['sensor'], row['scene'], row['interval']) == ('vlp-16', 'flat', None)
     found = [row[name] for name in ('iou', 'peer_iou', 'difference', 'share_without_model')]
     assert found == pytest.approx([0.9, 0.89, 0.01, 0.25])
     found = [row[f'{who}{name}'] for name in ('rmse', 'median_absolute') for who in ('', 'peer_')]
     assert found == pytest.approx([*(np.sqrt(11 / 3) * np.array([0.1, 0.2])), 0.1, 0.2])
-    row = scenes.lost_table(scores).json()[0]
-    assert [row[name] for name in ('vehicles', 'lost_vehicles', 'peer_lost_persons')] == [0, 0, 0]
+    table = scenes.lost_table(scores)
+    row = table.json()[0]
+    assert [row['iou'], row['peer_iou']] == [0.9, 0.89]
+    assert [row[name] for name in ('vehicles', 'lost_vehicles', 'peer_lost_vehicles')] == [6, 0, 3]
+    assert [row[name] for name in ('persons', 'lost_persons', 'peer_lost_persons')] == [4, 0, 2]
+    assert table.notes == ['objects lost: none', 'IoU behind x: vlp-16 ramp']
+    (note, _) = scenes.lost_table(scores.of(['x'], ['os1 ramp', 'vlp-16 flat'])).notes * 2
+    names = ('vlp-16 flat', 'os1 ramp')
+    lost = [f'{name} 3 of 6 vehicles, {name} 2 of 4 persons' for name in names]
+    assert note == f'objects lost: {", ".join(lost)}'
+    table = scenes.return_table(scores)
+    row = table.json()[0]
+    assert [row[name] for name in scenes.BANDS] == [0.0, None, 0.0]
+    assert [row[f'peer_{name}'] for name in scenes.BANDS] == [0.0, None, 3 / 100]
+    assert table.notes == ['more than x: nowhere']
+    row = scenes.low_table(scores).json()[0]
+    assert (row['things'], row['0.3 m'], row['peer_0.3 m'], row['0.2 m']) == (2, 0.0, 0.5, None)
+    flat, ramp, total = scenes.rough_table(every).json()
+    assert [row['scene'] for row in (flat, ramp, total)] == ['flat', 'ramp', 'all']
+    counts = [(ramp[name], total[name]) for name in ('scans', 'objects', 'lost', 'peer_lost')]
+    assert counts == [(2, 3), (12, 18), (0, 0), (2, 3)]
+    found = [(row['iou'], row['told_iou'], row['peer_iou']) for row in (flat, ramp, total)]
+    expected = [(0.9, 0.9, 0.89), (0.75, 0.85, 0.755), (0.825, 0.875, 0.8225)]
+    assert found == [pytest.approx(ratios) for ratios in expected]
+    assert total['peer_rmse'] == pytest.approx(0.2 * np.sqrt(11 / 3))
 
 
 @pytest.mark.slow
