@@ -188,34 +188,6 @@ def test_score_of_a_plane_by_loops(seed, share, lift):
     assert scores[planes.tolist().index(list(best))] == pytest.approx(scores.max(), rel=1e-12)
 
 
-def test_what_refutes_a_plane():
-    """Of one sector: points of a plane 1 m below the sensor, and one point far below it."""
-
-    def refutation(r_of_plane, r, depth):
-        r_all = np.array([*r_of_plane, r])
-        z = np.array([-1.0] * len(r_of_plane) + [-1.0 - depth])
-        zero, number = np.zeros(len(z), np.int64), np.zeros(len(z))
-        offsets = np.array([0, len(z)])
-        one = Candidates(r_all, z, zero, number, offsets, zero, r_all, number)
-        cells = ground_plane.lowest_points(one)
-        return ground_plane.refutation_of((1.0, 0.0, 0.0), cells, len(cells.z), ORIGIN)
-
-    def at(crossing):
-        return math.floor(8.0 * 4096.0 * slow_weight(crossing))
-
-    # The street between cars: its rays cross the plane of their roofs before it begins.
-    assert refutation([5.0, 7.0], 9.0, 2.0) == at(3.0)
-    # Land beside a dike: over its edge rays pass.
-    assert refutation([5.0, 7.0], 30.0, 2.0) == 0.0
-    # A mirror image on a wet road: where its ray crosses the road, the road is seen.
-    assert refutation([5.0, 7.0], 15.0, 2.0) == 0.0
-    # A hole in the plane, between its points.
-    assert refutation([5.0, 12.0], 24.0, 2.0) == at(8.0)
-    # Without a point on it in this direction, only near: that is the robot's own body.
-    assert refutation([], 6.0, 2.0) == at(2.0)
-    assert refutation([], 12.0, 2.0) == 0.0
-
-
 @pytest.mark.parametrize('backend', BACKENDS, ids=lambda b: b.name)
 def test_no_plane(backend):
     few = random_candidates(0, 1, 40, 1.0)

@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 from reference import Reference, fit_line
 from scipy.optimize import minimize
 
-from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg import Config
 from gp_ground_seg.core.frame import Candidates, Faces
 from gp_ground_seg.core.pipeline.lines import deming_slope, differs_in_direction
-from gp_ground_seg.lab.simulation import SCENES, VLP_16, simulate_scan
 
 N_TILES = 50
 NO_FACES = Faces(*np.zeros((2, N_TILES), dtype=bool))
@@ -123,25 +122,6 @@ def test_lines_and_pseudo_inputs_are_the_reference(backend, seed, per, error_rat
     assert len(found[0].r) == (~faces.has_occluded_base[candidates.tile]).sum()
 
 
-def test_the_candidates_drawn_hold_every_case():
-    """Slope breaks, and lines that do and do not continue, in the test above."""
-    at_break = continued = alone = 0
-    kinds = set()
-    changes = {'growth.min_bend_extent': 3.0, 'learning.length_scale': 'classes'}
-    changes |= {'lines.max_gap': 6.0, 'length_scale.max': 8.0}
-    config = Config().replace(**changes)
-    for seed in range(40):
-        _, lines, pseudo, continues, _ = Reference().extract_lines(
-            draw_candidates(seed), NO_FACES, config
-        )
-        at_break += continues[lines.start[:-1]].sum()
-        continued += (continues[1:] & (lines.line[1:] == lines.line[:-1])).sum()
-        alone += (~continues).sum()
-        kinds |= {*pseudo.kind}
-    assert min(at_break, continued, alone) > 20
-    assert kinds == {*range(9)}
-
-
 KINK = np.arange(3.0, 23.0)
 CRITICAL = {
     'gap': (candidates_of([3, 4, 6, 50, 55], np.zeros(5)), [0, 0, 1, 2, 2]),
@@ -226,15 +206,3 @@ def test_a_candidate_far_below_moves_no_slope_break_of_other_segments(backend):
     r, z = slope_at_16_m(0.05, step=1.5)
     start, at_break = breaks(backend, np.append(5.0, r), np.append(-3e30, z), offsets=[0, 1, 10])
     assert (start, at_break) == ([0, 1, 7, 10], [False, False, False])
-
-
-def test_a_ramp_seen_by_few_rings_is_ground():
-    missed = []
-    for changes in ({}, {'growth.min_bend_extent': 1000.0}):
-        segmenter = GroundSegmenter(Config().replace(**changes))
-        missed.append(0)
-        for seed in (0, 1):
-            scan = simulate_scan(SCENES['ramp'](seed), VLP_16, np.random.default_rng(seed))
-            far = scan.is_ground & (np.hypot(*scan.points[:, :2].T) > 25.0)
-            missed[-1] += (segmenter.segment(scan.points).label[far] != 1).sum()
-    assert missed[0] < 0.6 * missed[1]

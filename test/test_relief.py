@@ -175,25 +175,6 @@ def test_without_ground_near_the_sensor_there_is_no_relief(backend):
         assert backend.find_relief(candidates, NO_FACES, HEIGHT, Config())[0].is_level
 
 
-@pytest.mark.parametrize('turn', [1, 2, 3])
-def test_a_turned_scan_has_the_relief_turned(backend, turn):
-    def land(x, y):
-        return bank(20, 8.0)(x, y) + 0.4 * np.sin(x / 9.0) * np.cos(y / 7.0)
-
-    def turned(x, y):
-        for _ in range(turn):
-            x, y = y, -x
-        return land(x, y)
-
-    first, second = (
-        backend.find_relief(candidates_on(f, RINGS, spread=0.0), NO_FACES, HEIGHT, Config())[0]
-        for f in (land, turned)
-    )
-    heights = heights_of(first)
-    assert np.ptp(heights) > 2.0
-    np.testing.assert_allclose(heights_of(second), np.rot90(heights, turn), atol=1e-5)
-
-
 def test_between_middles_it_is_linear_and_beyond_the_border_constant():
     height = np.random.default_rng(0).normal(size=(N_SIDES, N_SIDES))
     relief = Relief.of(height)

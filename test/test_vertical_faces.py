@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import find_faces
 
-from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg import Config
 from gp_ground_seg.core.frame import OUTSIDE
 from gp_ground_seg.core.pipeline.vertical_faces import UNITS_PER_METRE
 
@@ -96,26 +96,6 @@ def test_returns_above_one_place_have_no_direction(backend):
         foot = np.column_stack([np.full(60, x), y, np.linspace(0.0, 0.09, 60)])
         above = [[x, place, z] for z in (0.5, 0.52, 0.55)]
         assert not is_occluded(backend, CORNER + np.vstack([foot, above]))
-
-
-def test_a_wall_seen_over_an_obstacle_is_no_ground(backend):
-    rng, n = np.random.default_rng(4), fewer(20_000, 6000)
-    azimuth, r = rng.uniform(-np.pi, np.pi, n), rng.uniform(2.0, 25.0, n)
-    ground = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full(n, -1.7)])
-    # Ahead, a hedge at 12 m occludes the ground behind it and the lowest 5 cm of a wall.
-    ahead, n = (np.abs(azimuth) < 0.4) & (r >= 12.0), n * 2 // 5
-    facade = [np.full(n, 16.2), rng.uniform(-4.0, 4.0, n), rng.uniform(-1.65, 0.5, n)]
-    facade = np.column_stack(facade) + rng.normal(0.0, 0.01, (n, 3))
-    scan = np.vstack([ground[~ahead], facade])
-    behind = np.arange(len(scan)) >= (~ahead).sum()
-    taken = {}
-    for distance in (Config().faces.max_foot_distance, 0.0):
-        config = Config().replace(**{'faces.max_foot_distance': distance, 'sensor.height': 1.7})
-        label = GroundSegmenter(config, backend=backend).segment(scan).label
-        assert (label[~behind] == Label.GROUND).mean() > 0.99
-        taken[distance] = (label[behind] == Label.GROUND).mean()
-    assert taken[0.0] > 0.001
-    assert taken[Config().faces.max_foot_distance] == 0.0
 
 
 @settings(max_examples=fewer(30, 10))
