@@ -188,6 +188,7 @@ CASES |= {
     'long_names.ply': (
         ply('float32 x,float32 y,float32 z,float64 t', with_ring(1, 2, 3, 4)), 'x y z t'
     ),
+    'list_of_unknown.ply': (ply(LISTED.replace('uchar', 'quad'), RAW, LE), 'is a list'),
     'unknown_type.ply': (ply('float x,float y,float z,quad t', RAW, LE), 'is a quad'),
     'float_as_integer.ply': (
         ply('float x,float y,float z,uchar t', with_ring('0.0', 1, 2, 'nan')), 'x y z t'

@@ -215,6 +215,12 @@ def test_fields_of_several_numbers_as_pcl_writes_them():
         np.testing.assert_array_equal(cloud.xyz, XYZ)
 
 
+@pytest.mark.parametrize('n', [0, 1])
+def test_a_text_of_one_point_or_none(n):
+    cloud = decode_file(Path('a.pcd'), pcd(body=b'1 2 3\n' * n, WIDTH=f'{n}', POINTS=f'{n}'))
+    assert cloud.xyz.tolist() == [[1.0, 2.0, 3.0]] * n
+
+
 def test_arrays_of_every_kind(tmp_path):
     xyz = dict(zip('XYZ', np.arange(9.0).reshape(3, 3), strict=True))
     np.savez(tmp_path / 'fields.npz', **xyz, points=np.arange(3), pose=np.eye(4))
@@ -304,6 +310,7 @@ LIES = {
         r'no field x of one number per point; fields: p \(4,\)',
     ),
     'commas.pcd': (pcd(body=4 * b'0,1,2\n'), 'a line of 1 words, its header says 3, separated by'),
+    'wide_text.pcd': (pcd(COUNT='1 1 500000000'), '500000002 numbers per point'),
     'flat.npy': (npy_bytes(np.arange(9.0)), r'array of shape \(9,\): must be \(N, 3\)'),
     'names.npz': (zip_of(a=npy_bytes(XYZ), b=npy_bytes(XYZ)), r'arrays a \(4, 3\), b \(4, 3\):'),
     'flat.npz': (zip_of(a=npy_bytes(np.arange(9.0))), r'arrays a \(9,\): must be x, y, z, or one'),

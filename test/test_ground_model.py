@@ -72,21 +72,6 @@ def test_height_under_every_point_is_that_of_the_segmentation(segmented):
     np.testing.assert_array_equal(np.isnan(model.length_scale), np.isnan(found.log_length_scale))
 
 
-def test_knots_are_exact(segmented):
-    model = rounded(GroundModel.of(segmented[1]))
-    # All directions meet at a range of 0, and beyond the last knot there is nothing.
-    inner = slice(int(model.knots[0] == 0.0), -1)
-    azimuth = model.azimuth[:, None]
-    x, y = model.knots[inner] * np.cos(azimuth), model.knots[inner] * np.sin(azimuth)
-    # A bin's far edge belongs to the next one, where rounding does not put it back.
-    has_next = np.isfinite(np.roll(model.height, -1, axis=1)[:, inner])
-    assert has_next.any()
-    for values, table in zip(model.at(x, y), (model.height, model.std), strict=True):
-        expected = table[:, inner]
-        np.testing.assert_allclose(values[has_next], expected[has_next], rtol=0, atol=1e-9)
-        assert np.isnan(values[np.isnan(expected)]).all()
-
-
 @pytest.mark.parametrize('tilt', [(0.3, -0.2), (-0.05, 0.5), (3.0, 0.1)])
 def test_in_a_tilted_frame_heights_are_on_the_surface(tilt):
     points = half_scan()

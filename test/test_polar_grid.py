@@ -116,23 +116,3 @@ def test_the_narrowest_bins_that_are_accepted_do_not_fill_the_memory():
         found = NumbaBackend().build_grid(xyz, config)
         assert_same_scan(found, NumpyBackend().build_grid(xyz, config))
         assert_same_scan(found, Reference().build_grid(xyz, config))
-
-
-def test_nothing_of_one_scan_shows_in_the_next():
-    n = fewer(5000, 500)
-    other = Config().replace(**{'faces.cell_size': 0.7})
-    scans = [
-        (n, Config(), np.float64), (n, Config(), np.float64), (300, Config(), np.float64),
-        (n, other, np.float64), (n, Config(), np.float64), (n, Config(), np.float32),
-        (0, Config(), np.float32), (2 * n, Config(), np.float64), (n, Config(), np.float64),
-    ]  # fmt: skip
-    backend = NumbaBackend()
-    for seed, (n_points, config, dtype) in enumerate(scans):
-        xyz = hilly_scan(n_points, seed=seed).astype(dtype)
-        xyz[::3] = np.round(xyz[::3])  # equal heights
-        found, fresh = backend.build_grid(xyz, config), NumpyBackend()
-        expected = fresh.build_grid(xyz, config)
-        assert_same_scan(found, expected)
-        faces, same = backend.find_faces(found, config), fresh.find_faces(expected, config)
-        np.testing.assert_array_equal(faces.is_face, same.is_face)
-        np.testing.assert_array_equal(faces.has_occluded_base, same.has_occluded_base)

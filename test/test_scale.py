@@ -8,10 +8,8 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
-import threading
 import time
 from concurrent.futures import BrokenExecutor
 from functools import partial
@@ -284,16 +282,6 @@ def test_a_scheduler_that_is_not_there(address, problem, root, monkeypatch, tmp_
     assert run(*command, '--scheduler', address) == 2
     assert problem in error_line(capsys)
     assert run(*command) == 0
-
-
-def test_a_port_where_no_scheduler_speaks(root, tmp_path, capsys):
-    with socket.create_server(('127.0.0.1', 0)) as server:
-        banner = threading.Thread(target=lambda: server.accept()[0].sendall(b'SSH-2.0-server\r\n'))
-        banner.start()
-        address = f'tcp://127.0.0.1:{server.getsockname()[1]}'
-        assert run('segment', root, '-o', tmp_path / 'out', '--scheduler', address) == 2
-        banner.join()
-    assert 'does not answer' in error_line(capsys)
 
 
 def test_a_scheduler_that_ends_meanwhile(root, tmp_path):

@@ -323,10 +323,16 @@ def test_a_result_is_not_changed_by_the_next_scan(backend, scan):
 
 @pytest.mark.parametrize('mode', ['fixed', 'every_frame'])
 def test_history_does_not_change_a_bit(backend, scan, mode):
+    """Scans of other sizes and precisions, and other tiles, in the same buffers."""
     config = CONFIG.replace(**{'learning.mode': mode})
+    scan[::3] = np.round(scan[::3])  # equal heights
     expected = GroundSegmenter(config, backend=type(backend)()).segment(scan)
     other = GroundSegmenter(config, backend=backend)
-    other.segment(hilly_scan(N_POINTS, seed=9))
+    for n_points, dtype in ((2 * N_POINTS, 'f8'), (300, 'f8'), (N_POINTS, 'f4'), (0, 'f8')):
+        other.segment(hilly_scan(n_points, seed=9).astype(dtype))
+    other.configure(config.replace(**{'faces.cell_size': 0.7}))
+    other.segment(hilly_scan(N_POINTS, seed=8))
+    other.configure(config)
     result = other.segment(scan)
     same(result, expected)
     np.testing.assert_array_equal(result.theta, expected.theta)

@@ -5,11 +5,12 @@ import math
 
 import numpy as np
 import pytest
+from test_costmap import Segmented
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.data import costmap, step_edges
-from gp_ground_seg.data.costmap import DIRECTIONS, OCCUPIED, Placement, SegmentedCloud
+from gp_ground_seg.data.costmap import DIRECTIONS, OCCUPIED
 from gp_ground_seg.data.step_edges import SECTORS, find_edges
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 from gp_ground_seg.lab.simulation.objects import car, wall
@@ -28,10 +29,8 @@ OS1_64 = dataclasses.replace(
 MOUNTED = {
     name: dataclasses.replace(sensor, n_columns=900)
     for name, sensor in {
-        'hdl-64e': SENSORS['hdl-64e'],
+        **{name: SENSORS[name] for name in ('hdl-64e', 'vlp-16', 'os1-128')},
         'os1-64': OS1_64,
-        'vlp-16': SENSORS['vlp-16'],
-        'os1-128': SENSORS['os1-128'],
         'os1-128 low': dataclasses.replace(SENSORS['os1-128'], height=0.5),
     }.items()
 }
@@ -53,19 +52,13 @@ def descent(at, degrees, fall, heading=0.0):
     return polyline(heading, [(at, 0.0), (at + fall / slope, -fall)])
 
 
-class Segmented(SegmentedCloud):
-    """Of points instead of a message."""
-
-    points = property(lambda self: self.cloud)
-
-
-def segmented(scene, sensor, seed=0, placement=None, **values):
+def segmented(scene, sensor, seed=0, **values):
     """Simulated scan of terrain or a scene, and what is published of it."""
     scene = scene if isinstance(scene, Scene) else Scene('', scene)
     scan = simulate_scan(scene, sensor, np.random.default_rng(seed))
     config = Config().replace(**{'output.max_step_down': MAX_STEP_DOWN, **values})
     xyz = scan.points[:, :3]
-    return Segmented(xyz, GroundSegmenter(config).segment(xyz), config, placement)
+    return Segmented(xyz, GroundSegmenter(config).segment(xyz), config)
 
 
 def inputs_of(cloud):
@@ -278,19 +271,12 @@ def test_order_and_strange_points_do_not_matter():
     assert np.isinf(find_edges(xyz, ~is_ground, stands, MAX_STEP_DOWN).r).all()
 
 
-def marked(cloud):
-    """Ranges of the scan without obstacles, and the cells that are occupied."""
-    returns = cloud.places(np.isfinite(cloud.points).all(axis=1))
-    reach = np.full(DIRECTIONS, 100.0, np.float32)
-    ground = cloud.places(cloud.is_ground)
-    return (
-        costmap.scan_ranges(cloud.blocked, returns),
-        costmap.occupancy(ground, cloud.blocked, reach, 0.1, 20.0) == OCCUPIED,
-    )
-
-
 def test_scan_ends_at_the_edge_and_occupancy_has_it():
-    ranges, occupied = marked(segmented(drop(6.0, 0.6), MOUNTED['hdl-64e']))
+    cloud = segmented(drop(6.0, 0.6), MOUNTED['hdl-64e'])
+    returns = cloud.places(np.isfinite(cloud.points).all(axis=1))
+    ranges = costmap.scan_ranges(cloud.blocked, returns)
+    reach, ground = np.full(DIRECTIONS, 100.0, np.float32), cloud.places(cloud.is_ground)
+    occupied = costmap.occupancy(ground, cloud.blocked, reach, 0.1, 20.0) == OCCUPIED
     towards = (np.arange(DIRECTIONS) + 0.5) * 2.0 * np.pi / DIRECTIONS - np.pi
     distance = 6.0 / np.maximum(np.cos(towards), 1e-6)
     near = distance < 9.0
@@ -314,7 +300,7 @@ def test_off_nothing_is_looked_for(monkeypatch):
 
 
 def test_edges_lie_where_the_ground_ends_in_any_frame():
-    """A tilted sensor, a cloud in the frame of the vehicle on the ground, an output frame."""
+    """A tilted sensor, and a cloud in the frame of the vehicle; output frames: test_costmap.py."""
     terrain, sensor = drop(6.0, 0.6, 0.3), MOUNTED['hdl-64e']
 
     def along(cloud, matrix=None):
@@ -333,12 +319,9 @@ def test_edges_lie_where_the_ground_ends_in_any_frame():
     values = {'sensor.roll': 0.15, 'sensor.pitch': -0.2, 'output.max_step_down': MAX_STEP_DOWN}
     config = Config().replace(**values)
     xyz = level.points @ matrix.astype(np.float32)
-    placement = Placement(matrix, np.array([3.0, 4.0, 5.0]))
-    found = GroundSegmenter(config).segment(xyz)
-    tilted = along(Segmented(xyz, found, config), matrix)
-    for places in (tilted, along(Segmented(xyz, found, config, placement))):
-        assert np.median(places) == pytest.approx(np.median(expected), abs=0.05)
-        assert len(places) == pytest.approx(len(expected), rel=0.05)
+    places = along(Segmented(xyz, GroundSegmenter(config).segment(xyz), config), matrix)
+    assert np.median(places) == pytest.approx(np.median(expected), abs=0.05)
+    assert len(places) == pytest.approx(len(expected), rel=0.05)
 
     vehicle = segmented(
         terrain,
