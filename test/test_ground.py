@@ -54,7 +54,17 @@ def surface_by_the_loops(seed):
         **{'grid.n_segments': int(rng.choice([5, 7, 35, fewer(96, 12)])), 'grid.n_bins': 80}
     )
     xyz = hilly_scan(int(rng.choice([0, 30, 900])), seed)
+    config = config.replace(**{
+        'label.rule': str(rng.choice(['roughness', 'roughness', 'tolerance'])),
+        'growth.max_std': float(rng.choice([0.1, 0.35, 1.0])),
+        'growth.max_standardised_residual': float(rng.choice([1.0, 2.0, 8.0])),
+        'growth.max_standardised_depth': float(rng.choice([2.0, 4.0])),
+        'growth.seed_range': float(rng.choice([5.5, 20.0])),
+        'growth.seed_height_tolerance': float(rng.choice([0.2, 0.45])),
+    })  # fmt: skip
     frame = frame_of(xyz[rng.random() * xyz[:, 1] > -5.0], config)
+    if rng.random() < 0.5:  # lines that are steep, as of walls, are followed too
+        frame = frame._replace(continues_line=rng.random(len(frame.candidates.r)) < 0.5)
     theta = given_theta(config)
     theta += np.where(np.arange(6) < 5, 0.3, 1.0) * rng.normal(size=theta.shape)
     if rng.random() < 0.3:
@@ -100,45 +110,6 @@ def test_the_oracle_is_the_conditional_of_the_joint_gaussian(seed, n, slope_std)
     np.testing.assert_allclose(found, mean + conditional(latent, values - mean)[0], atol=1e-9)
 
 
-def test_noise_free_candidates_are_interpolated_with_no_uncertainty(backend):
-    config = config_of('constant').replace(**{'length_scale.constant': 1.0})
-    r, z = np.arange(3.0, 15.0), 0.05 * np.sin(np.arange(12.0))
-    frame = frame_of(np.column_stack([r, 0.01 * r, z - 1.73]), config)
-    # Knots where the candidates are.
-    places = frame.candidates.r
-    frame = frame._replace(
-        candidates=frame.candidates._replace(bin=np.arange(len(r))),
-        knots=np.append(places, places[-1] + 1.0),
-        continues_line=np.ones(len(r), dtype=bool),
-        in_face=np.zeros(len(r), dtype=bool),
-    )
-    theta = given_theta(config)
-    theta[1] = np.log(1e-6)
-    surface, *_ = backend.estimate_surface(frame, theta, config)
-    m = frame.candidates.segment[0]
-    assert surface.inlier.all()
-    # Up to the rounding that is taken for noise, 1e-6 and 1e-3 of sigma_f.
-    of_mean, most = {'numpy': (1e-6, 1e-5), 'numba': (2e-4, 4e-4)}[backend.name]
-    np.testing.assert_allclose(surface.mean[m, :-1], z - 1.73, atol=of_mean)
-    assert (surface.std[m, :-1] < most).all()
-
-
-@pytest.mark.parametrize(('rule', 'n_shown'), [('roughness', 1), ('tolerance', 3)])
-def test_candidates_close_together_show_as_much_as_one(backend, rule, n_shown):
-    config = config_of('constant', slope_std=0.0).replace(
-        **{'length_scale.constant': 50.0, 'label.rule': rule}
-    )
-    sigma_f, sigma_n = np.exp(given_theta(config)[:2])
-    for r, n in ([4.0, 4.75, 5.5], n_shown), ([4.0, 8.0, 12.0], 3):
-        r = np.array(r)
-        frame = frame_of(np.column_stack([r, 0.01 * r, np.full(3, -1.73)]), config)
-        surface, *_ = backend.estimate_surface(frame, given_theta(config), config)
-        assert surface.inlier.all() and len(surface.inlier) == 3
-        expected = (1.0 / sigma_f**2 + n / sigma_n**2) ** -0.5
-        std = surface.std[frame.candidates.segment[0]]
-        assert np.nanmin(std) == pytest.approx(expected, rel=0.02)
-
-
 def test_rounding_beside_little_noise_is_no_fault(backend):
     config = config_of('constant', slope_std=2.0).replace(
         **{
@@ -157,64 +128,6 @@ def test_rounding_beside_little_noise_is_no_fault(backend):
     assert surface.inlier.all()
     rounding = {'numpy': 1e-3, 'numba': 1e-2}[backend.name]
     np.testing.assert_allclose(surface.mean[m], -1.73, atol=rounding)
-
-
-def grow_line(backend, z, r=None, continues=(), slope_std=0.05, **bounds):
-    """Inliers, knots, mean and std of one segment; up to 5.5 m low candidates are seeds."""
-    r = np.arange(3.0, 3.0 + len(z)) if r is None else np.asarray(r, dtype=float)
-    seeds = {'seed_range': 5.5, 'seed_height_tolerance': 0.25}
-    config = config_of('constant', slope_std, **{**seeds, **bounds})
-    frame = frame_of(np.column_stack([r, 0.01 * r, np.asarray(z) - 1.73]), config)
-    frame = frame._replace(continues_line=np.isin(np.arange(len(z)), continues))
-    surface, *_ = backend.estimate_surface(frame, given_theta(config), config)
-    m, known = frame.candidates.segment[0], np.isfinite(surface.mean[frame.candidates.segment[0]])
-    values = frame.knots[known], surface.mean[m, known] + 1.73, surface.std[m, known]
-    return list(np.flatnonzero(surface.inlier)), *values
-
-
-def test_growth_follows_ground_and_leaves_obstacles_out(backend):
-    for height in 0.6, 0.8, 1.0, 1.2:
-        z = np.zeros(20)
-        z[8:11] = height
-        inlier, knots, mean, _ = grow_line(backend, z)
-        # What is within the gate joins in doubt, and lifts nothing.
-        assert set(inlier) >= {*range(8), *range(11, 20)}
-        assert np.max(np.abs(mean[knots < 20])) < 0.02
-    assert inlier == [*range(8), *range(11, 20)]
-
-
-def test_growth_stops_where_the_surface_is_uncertain(backend):
-    inlier, _, _, std = grow_line(backend, np.zeros(8), r=[*range(3, 10), 60.0])
-    assert inlier == list(range(7))
-    assert std.max() > Config().growth.max_std
-    # Far from data the mean follows the slope, and is the less certain for it.
-    z, r = 0.05 * np.array([*range(3, 10), 60.0]), [*range(3, 10), 60.0]
-    (knots, mean, std), (_, level, level_std) = (
-        grow_line(backend, z, r, slope_std=s, seed_range=20.0)[1:] for s in (0.1, 0.0)
-    )
-    assert mean[-1] == pytest.approx(0.05 * knots[-1], abs=0.5)
-    assert level[-1] == pytest.approx(0.0, abs=1e-3)
-    assert std[-1] > level_std[-1]
-
-
-def test_below_the_prediction_the_gate_is_wider_than_above(backend):
-    z = np.zeros(12)
-    # Beside the seeds, where the surface is certain.
-    z[3] = 0.4
-    without = [0, 1, 2, *range(4, 12)]
-    assert grow_line(backend, z)[0] == without
-    assert len(grow_line(backend, -z)[0]) == 12
-    assert grow_line(backend, -z, max_standardised_depth=2.0)[0] == without
-
-
-def test_a_line_is_followed_from_inliers_on(backend):
-    z = np.concatenate([np.zeros(6), 0.8 * np.arange(1.0, 9.0)])
-    assert grow_line(backend, z)[0] == list(range(6))
-    # The line begins at 6, which is no inlier: nothing to continue.
-    assert grow_line(backend, z, continues=range(7, 14))[0] == list(range(6))
-    inlier, knots, mean, _ = grow_line(backend, z, continues=range(5, 14))
-    assert inlier == list(range(14))
-    assert mean[np.searchsorted(knots, 14.0)] > 1.0
 
 
 def ring_of_ground(backend, lift, **values):
@@ -305,13 +218,3 @@ def test_the_odds_of_an_obstacle_are_those_of_the_frame(n_walls):
     stands = frame.candidates.z > -1.0
     odds = seeds(frame, given_theta(config), config)[1]
     assert odds == pytest.approx(max(stands.sum() / (~stands).sum(), ODDS), rel=0.02)
-
-
-def test_among_many_obstacles_sills_lift_less(backend):
-    def lifted(n_walls):
-        frame, config = frame_of_a_sill(n_walls)
-        config = config.replace(**{'observation.sigma_f': 0.35})
-        surface = backend.estimate_surface(frame, given_theta(config), config)[0]
-        return surface.mean[135, np.searchsorted(frame.knots, 8.0)] + 1.73
-
-    assert lifted(85) < 0.7 * lifted(0)

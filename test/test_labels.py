@@ -104,16 +104,6 @@ def test_ground_as_rough_as_that_everywhere_is_ground(backend):
     np.testing.assert_allclose(band, 2.1 * 0.3 / np.sqrt(3.0), rtol=0.15)
 
 
-def test_where_few_tiles_are_seen_the_frame_counts(backend):
-    # One thing by itself behind a gap, and much smooth ground.
-    ground = ground_about(4.0, 0.01, np.random.default_rng(7))
-    thing = np.column_stack([np.full(20, 60.0), np.linspace(-0.2, 0.2, 20), np.full(20, 0.4)])
-    found = labels_of(backend, np.concatenate([ground, thing]), r_max=80.0)
-    assert (found.label[-20:] == Label.OBSTACLE).all()
-    # Nothing else is seen: it may be ground.
-    assert (labels_of(backend, thing, r_max=80.0).label == Label.GROUND).all()
-
-
 def test_of_a_face_only_the_base_is_ground_and_nothing_where_it_is_occluded(backend):
     # The surface climbs a step, and its riser lies on it.
     ranges, riser = [5.0, 5.001, 5.002], np.array([0.0, 0.04, 0.14])
@@ -151,16 +141,6 @@ def test_probability_is_a_half_at_the_edge_and_follows_the_certainty():
     assert found[0] == 0.5
     assert found[1] > found[2] > 0.5
     assert found[4] == 0.0
-
-
-@pytest.mark.parametrize(('rough', 'expected'), [(0.0, 'OOO'), (0.16, 'GOO'), (0.4, 'GGO')])
-def test_the_band_follows_the_roughness_up_to_the_height_of_no_ground(backend, rough, expected):
-    # Beside the points, as many below the surface as make that roughness.
-    ranges = np.concatenate([[3.0, 5.0, 7.0], np.tile([3.0, 5.0, 7.0], 3000)])
-    heights = np.concatenate([[0.3, 0.45, 0.51], np.full(9000, -rough)])
-    found, _ = label(backend, ranges, heights)
-    assert [Label(value).name[0] for value in found.label[:3]] == list(expected)
-    assert list(label(backend, ranges, heights, rule='tolerance')[0].label[:3]) == [O, O, O]
 
 
 @settings(max_examples=fewer(20, 10))

@@ -87,6 +87,12 @@ def draw_candidates(seed, n_segments=8, most=30):
     return candidates_of(r, z, np.exp(density), offsets)._replace(tile=tile)
 
 
+BOUNDS = (
+    'growth.max_line_slope', 'growth.min_line_size', 'growth.min_bend_extent',
+    'lines.max_density_ratio',
+)  # fmt: skip
+
+
 def draw_faces(seed):
     return Faces(*(np.random.default_rng(seed).uniform(size=(2, N_TILES)) < 0.2))
 
@@ -97,14 +103,17 @@ def draw_faces(seed):
     st.sampled_from([1.0, 2.5, 3.0, 10.0]),
     st.floats(0.2, 5.0),
     st.sampled_from(['factor', 'classes']),
+    st.sampled_from([(1.0, 4, 3.0, 8.0), (0.2, 3, 9.0, 1.5), (10.0, 7, 99.0, 100.0)]),
 )
-def test_lines_and_pseudo_inputs_are_the_reference(backend, seed, per, error_ratio, shared):
+def test_lines_and_pseudo_inputs_are_the_reference(
+    backend, seed, per, error_ratio, shared, bounds
+):
     candidates, faces = draw_candidates(seed), draw_faces(seed)
     config = Config().replace(
         **{
             'lines.max_gap': 6.0,
             'lines.error_ratio': error_ratio,
-            'growth.min_bend_extent': 3.0,
+            **dict(zip(BOUNDS, bounds, strict=True)),
             'latent.candidates_per_pseudo_input': per,
             'learning.length_scale': shared,
             'length_scale.max': 8.0,
@@ -120,46 +129,6 @@ def test_lines_and_pseudo_inputs_are_the_reference(backend, seed, per, error_rat
     for ours, theirs in zip(found[3:], expected[3:], strict=True):
         np.testing.assert_array_equal(ours, theirs)
     assert len(found[0].r) == (~faces.has_occluded_base[candidates.tile]).sum()
-
-
-KINK = np.arange(3.0, 23.0)
-CRITICAL = {
-    'gap': (candidates_of([3, 4, 6, 50, 55], np.zeros(5)), [0, 0, 1, 2, 2]),
-    'density': (
-        candidates_of([3, 4, 5, 6, 7], np.zeros(5), [10, 20, 2.4, 2.4, 30]),
-        [0, 0, 1, 1, 2],
-    ),
-    'segment': (candidates_of([3, 4, 5], np.zeros(3), offsets=[0, 2, 2, 3]), [0, 0, 1]),
-    'up': (candidates_of(KINK, 0.5 * np.maximum(KINK - 12.0, 0.0)), [0] * 10 + [1] * 10),
-    'down': (candidates_of(KINK, -0.5 * np.maximum(KINK - 12.0, 0.0)), [0] * 10 + [1] * 10),
-    'nothing': (candidates_of([], []), []),
-}
-
-
-@pytest.mark.parametrize('name', CRITICAL)
-def test_critical_points(backend, name):
-    candidates, expected = CRITICAL[name]
-    gaps = {'lines.max_gap': 1.0, 'lines.max_gap_growth': 0.1}
-    lines, _ = extract(backend, candidates, {**gaps, 'lines.max_density_ratio': 8.0})
-    assert list(lines.line) == expected
-    np.testing.assert_array_equal(np.isnan(lines.slope), np.diff(lines.start) == 1)
-    for q, extent in enumerate(lines.extent(candidates)):
-        assert extent == np.ptp(candidates.r[lines.line == q])
-
-
-def test_long_and_flat_lines_are_continued(backend):
-    # A road, a ramp of 0.3, a wall of three candidates.
-    r = np.concatenate([np.arange(2.0, 8.0), np.arange(8.0, 14.0), [14.0, 14.2, 14.4]])
-    z = np.concatenate([np.zeros(6), 0.3 * np.arange(1.0, 7.0), [2.5, 3.5, 4.5]])
-    both = [*range(1, 6), *range(7, 12)]
-    for max_slope, min_size, expected in (
-        (1.0, 4, both), (0.2, 4, both[:5]), (10.0, 3, [*both, 13, 14]), (1.0, 7, []),
-    ):  # fmt: skip
-        bounds = {'growth.max_line_slope': max_slope, 'growth.min_line_size': min_size}
-        bounds['growth.min_bend_extent'] = 99.0
-        lines, continues = extract(backend, candidates_of(r, z), bounds)
-        assert list(lines.start) == [0, 6, 12, 15]
-        assert list(np.flatnonzero(continues)) == expected
 
 
 def breaks(backend, r, z, offsets=None, **bounds):
@@ -189,17 +158,6 @@ def slope_at_16_m(rise, step=0.0):
 )
 def test_a_slope_starts_at_a_break_and_a_step_does_not(backend, rise, step, at_break):
     assert breaks(backend, *slope_at_16_m(rise, step)) == ([0, 6, 9], [False, at_break])
-
-
-def test_lines_that_are_short_or_steep_or_of_two_candidates_start_at_no_break(backend):
-    assert breaks(backend, *slope_at_16_m(0.3), max_line_slope=1.0)[1] == [False, True]
-    r, z = slope_at_16_m(0.12)
-    assert breaks(backend, r, z, min_bend_extent=21.0)[1] == [False, False]
-    assert breaks(backend, r, z, max_line_slope=0.1)[1] == [False, False]
-    few = breaks(backend, r[:-1], z[:-1], min_bend_extent=1.0)
-    assert few == ([0, 6, 8], [False, False])
-    # The line before must lie in the same segment.
-    assert breaks(backend, r, z, offsets=[0, 6, 9])[1] == [False, False]
 
 
 def test_a_candidate_far_below_moves_no_slope_break_of_other_segments(backend):

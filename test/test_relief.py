@@ -156,17 +156,6 @@ def test_raised_land_is_entered_over_more_than_a_car(backend, width, expected):
     np.testing.assert_allclose(terrace, expected, atol=0.05)
 
 
-def test_nobody_walks_on_faces_or_where_each_segment_is_by_itself(backend):
-    candidates = candidates_on(bank(25, 10.0), RINGS)
-    by_itself = Config().replace(**{'surface.look_aside': False})
-    is_bank = candidates.z + HEIGHT > 0.05
-    faces = Faces(np.arange(N_TILES) == 0, np.zeros(N_TILES, dtype=bool))
-    marked = candidates._replace(tile=np.where(is_bank, 0, 1).astype(np.int32))
-    for walked, config in ((candidates, by_itself), (marked, Config())):
-        assert backend.find_relief(walked, faces, HEIGHT, config)[0].is_level
-    assert not backend.find_relief(marked, NO_FACES, HEIGHT, Config())[0].is_level
-
-
 def test_without_ground_near_the_sensor_there_is_no_relief(backend):
     behind = candidates_on(bank(25, 10.0), RINGS[RINGS > 14.0])
     behind = behind.where(behind.x > 13.0)

@@ -265,10 +265,10 @@ def labelled_by_the_loops(*changes):
 @pytest.mark.parametrize(
     ('model', 'objective'),
     [
-        *(('latent', 'map'), ('line_gradient', 'paper'), ('constant', 'paper')),
+        ('latent', 'map'),
+        ('line_gradient', 'paper'),
+        ('constant', 'paper'),
         pytest.param('latent', 'paper', marks=pytest.mark.slow),
-        pytest.param('line_gradient', 'map', marks=pytest.mark.slow),
-        pytest.param('constant', 'map', marks=pytest.mark.slow),
     ],
 )
 def test_frames_are_labelled_as_by_the_loops(backend, model, objective):
