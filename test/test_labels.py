@@ -112,26 +112,6 @@ def test_of_a_face_only_the_base_is_ground_and_nothing_where_it_is_occluded(back
         assert list(label(backend, ranges, riser, surface, faces)[0].label) == expected
 
 
-@pytest.mark.parametrize(
-    ('away', 'high', 'expected'),
-    [
-        ((), 0.08, O),
-        ((0.5,), 0.08, G),
-        ((0.5,), 0.02, O),
-        ((0.5, 1.0), 0.08, G),
-        ((1.0,), 0.08, O),
-    ],
-)
-def test_returns_of_one_height_in_tiles_side_by_side_are_judged_together(
-    backend, away, high, expected
-):
-    # A return 0.08 m over the lowest of a face is an obstacle by itself. Beside it is ground.
-    places = [(5.25, 0.0), (5.25, 0.08), *((5.25 + step, high) for step in away for _ in range(8))]
-    ranges, z = np.transpose(places)
-    found, _ = label(backend, ranges, z, faces={0: False}, angle=0.02)
-    assert list(found.label) == [G, expected, *[G] * 8 * len(away)]
-
-
 def test_probability_is_a_half_at_the_edge_and_follows_the_certainty():
     margin = np.array([0.0, 0.1, 0.1, -0.1, np.nan])
     std = np.array([0.1, 0.01, 0.3, 0.01, np.nan])
