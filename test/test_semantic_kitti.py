@@ -81,10 +81,8 @@ def test_frames_in_order_with_and_without_labels(tmp_path):
 def test_times_belong_to_the_numbers_of_the_files(tmp_path):
     for index in (1, 3):
         write_frame(tmp_path, '00', index, street()[0])
-    assert [frame.time for frame in list_frames(tmp_path, '00')] == [
-        0.0,
-        semantic_kitti.FRAME_PERIOD,
-    ]
+    found = [frame.time for frame in list_frames(tmp_path, '00')]
+    assert found == [0.0, semantic_kitti.FRAME_PERIOD]
     times = tmp_path / 'sequences/00/times.txt'
     times.write_text('0.000000e+00\n1.036e-01\n2.1e-01\n3.2e-01\n')
     assert [frame.time for frame in list_frames(tmp_path, '00')] == [0.1036, 0.32]
