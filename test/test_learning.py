@@ -205,19 +205,6 @@ def test_every_nth_segment_by_itself_has_the_inliers_it_has_in_the_frame(step):
     assert len(own.knots) == 0
 
 
-def segmenter_of(**changes):
-    return GroundSegmenter(Config().replace(**changes), backend=MODEL)
-
-
-def test_modes():
-    for mode, is_learned in (('every_frame', True), ('fixed', False)):
-        segmenter = segmenter_of(**{'learning.mode': mode})
-        fits = [segmenter.segment(hilly_scan(N_POINTS, seed=s)).fit for s in (1, 2)]
-        assert [fit.status != 'kept' for fit in fits] == [is_learned] * 2
-    assert fits[1].n_evaluations == 0
-    assert fits[1].theta['sigma_n'] == pytest.approx(Config().observation.sigma_n)
-
-
 def test_the_preset_paper_learns_until_no_more_join():
     """Nine classes of lines share their length-scales, which stay between their limits."""
     config = PRESETS['paper'].config

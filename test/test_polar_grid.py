@@ -11,11 +11,9 @@ from gp_ground_seg import Config
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.frame import OUTSIDE
-from gp_ground_seg.core.parameters.config import NARROWEST_BIN, GridConfig
+from gp_ground_seg.core.parameters.config import NARROWEST_BIN
 from gp_ground_seg.core.pipeline.polar_grid import (
     LARGEST_TABLE,
-    azimuth_key,
-    bin_edges,
     grid_geometry,
 )
 
@@ -56,20 +54,6 @@ def test_cell_of_a_point(backend, x, y, n_segments, n_bins, growth):
         assert grid.segment[0] in {round(turn) % n_segments, (round(turn) - 1) % n_segments}
     else:
         assert grid.segment[0] == int(turn)
-
-
-@given(st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi), st.floats(0.01, 1e3))
-def test_azimuth_key_grows_with_the_angle(one, other, r):
-    first, second = azimuth_key(r * np.cos([one, other]), r * np.sin([one, other]), np.float64)
-    assert 0.0 <= first <= 4.0
-    if one + 1e-9 < other:
-        assert first < second
-
-
-def test_edges_span_the_range_and_grow():
-    edges = bin_edges(GridConfig(n_bins=10, r_min=1.0, r_max=101.0, bin_growth=2.0))
-    assert (edges[0], edges[-1]) == (1.0, 101.0)
-    np.testing.assert_allclose(np.diff(edges), 1.0 + 2.0 * np.arange(10))
 
 
 def test_both_sides_of_the_negative_x_axis(backend):

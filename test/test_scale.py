@@ -175,13 +175,6 @@ def test_a_block_that_ends_every_worker_is_named(workers):
     assert '7' in str(caught.value)
 
 
-def test_a_worker_that_died_is_said(tmp_path, caplog):
-    with cluster.open_runner(2, None, cluster._NO_BAR) as runner:
-        runner.run(partial(_die_once, tmp_path / 'died'), range(40))
-    (line,) = caplog.messages
-    assert re.fullmatch(r'a worker died; computed again: [1-4] blocks', line)
-
-
 def test_a_worker_that_dies_before_the_work_begins(caplog):
     is_first = True
 

@@ -186,15 +186,6 @@ def test_nothing_is_seen_behind_a_wall():
     assert set(result.kind[shadow]) == {Kind.TERRAIN, Kind.WALL}
 
 
-def test_ground_is_seen_under_an_overhang():
-    deck = objects.floating_box(FLAT.terrain, 15.0, 0.0, (10.0, 30.0, 1.0), 1.9)
-    result = simulated(Scene('deck', FLAT.terrain, (deck,)), EXACT)
-    x, y, _, _ = result.points.T
-    under = (np.abs(x - 15.0) < 5.0) & (np.abs(y) < 15.0)
-    assert set(result.kind[under]) == {Kind.TERRAIN, Kind.OVERHANG}
-    assert result.points[result.kind == Kind.OVERHANG, 2].min() >= 1.9 - 1.73 - 1e-5
-
-
 def test_reflections_are_mirror_images():
     """On a level wet road the image of a wall's face is that face, below the ground."""
     wall = objects.wall(FLAT.terrain, (12.0, -6.0), (12.0, 6.0), 2.0)

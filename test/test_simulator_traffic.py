@@ -14,7 +14,6 @@ from gp_ground_seg.lab.simulation import (
     PLACES,
     SCENES,
     SENSORS,
-    VLP_16,
     Kind,
     Scene,
     objects,
@@ -232,14 +231,3 @@ def test_a_merged_cloud_is_of_both_sensors_in_one_frame():
         error = (made.points[:, 2] - made.ground_z)[part][made.is_ground[part]]
         assert np.abs(error).max() < 0.1
     assert made.position[2] == 0.0
-
-
-def test_the_low_and_the_tilted_sensor():
-    low = simulated(BARE, SENSORS['vlp-16-low'])
-    assert np.median(low.points[:, 2]) == pytest.approx(-0.15, abs=0.01)
-    tilted = simulated(BARE, SENSORS['qt64-tilted'])
-    up = tilted.rotation[2]
-    assert math.degrees(math.acos(up[2])) == pytest.approx(36.2, abs=0.1)
-    np.testing.assert_allclose(np.median(tilted.points[:, :3] @ up), -1.2, atol=0.01)
-    known = {'name': 'vlp-16', 'height': 0.8, 'min_range': 0.5}
-    assert replace(SENSORS['vlp-16-low'], **known) == VLP_16

@@ -204,21 +204,17 @@ def test_columns_are_for_files_of_scans(tmp_path, monkeypatch, capsys):
     assert what_is_there(tmp_path / 'a.mcap') == ['a.mcap']
 
 
-@pytest.mark.parametrize('command', ['segment', 'evaluate'])
-def test_a_scan_of_300_gigabytes_is_refused_by_its_size(command, root, capsys):
-    (scan,) = root.glob('sequences/00/velodyne/*.bin')
-    os.truncate(scan, SPARSE)
-    assert run(*words_of(command, root)) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert f'{scan}: {SPARSE} bytes, accepted are at most {1 << 30}' in line
-    assert what_is_there(root) == ['root']
-
-
-def test_other_huge_files_are_refused_by_their_size(root, tmp_path, capsys):
+def test_huge_files_are_refused_by_their_size(root, tmp_path, capsys):
     folder = root / 'sequences' / '00'
     scan, label, times = (
         folder / name for name in ('velodyne/000000.bin', 'labels/000000.label', 'times.txt')
     )
+    whole = scan.read_bytes()
+    os.truncate(scan, SPARSE)
+    for words in (['segment', scan, '-o', tmp_path / 'a.label'], ['evaluate', root]):
+        assert run(*words, *COLUMNS) == 2
+        assert f'{scan}: {SPARSE} bytes, accepted are at most {1 << 30}' in error_line(capsys)
+    scan.write_bytes(whole)
     n_points, yaml = scan.stat().st_size // 20, tmp_path / 'huge.yaml'
     for path in (label, times, yaml):
         path.touch()
