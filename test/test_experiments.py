@@ -19,10 +19,7 @@ from gp_ground_seg.lab.scoring.evaluate import OURS
 from gp_ground_seg.lab.scoring.frames import make_scores
 from gp_ground_seg.lab.scoring.metrics import count_labels, height_sums, label_ratios
 from gp_ground_seg.lab.scoring.objects import CLASSES, count_objects
-from gp_ground_seg.lab.scoring.peers import (
-    InterpolationMethod,
-    ground_points,
-)
+from gp_ground_seg.lab.scoring.peers import InterpolationMethod, ground_points
 from gp_ground_seg.lab.simulation import Kind
 from gp_ground_seg.lab.simulation.objects import object_heights
 

@@ -73,10 +73,7 @@ def test_counts_are_in_words():
     label = np.array([0, 1, 1, 2, 2, 2], dtype=np.uint8)
     truth = np.array([1, 1, 2, 1, 2, 0], dtype=np.uint8)
     words = [label_layers(label)[0], label_layers(label[1:])[0]]
-    assert words == [
-        '6 points: 2 ground, 3 obstacle, 1 unknown',
-        '5 points: 2 ground, 3 obstacle',
-    ]
+    assert words == ['6 points: 2 ground, 3 obstacle, 1 unknown', '5 points: 2 ground, 3 obstacle']
     assert label_layers(label, truth)[0] == '1 false ground, 2 missed ground, IoU 25.00 %'
     assert label_layers(label[:0], truth[:0])[0] == '0 false ground, 0 missed ground'
 

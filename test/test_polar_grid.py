@@ -12,10 +12,7 @@ from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.frame import OUTSIDE
 from gp_ground_seg.core.parameters.config import NARROWEST_BIN
-from gp_ground_seg.core.pipeline.polar_grid import (
-    LARGEST_TABLE,
-    grid_geometry,
-)
+from gp_ground_seg.core.pipeline.polar_grid import LARGEST_TABLE, grid_geometry
 
 PLACE = st.floats(-120, 120)
 

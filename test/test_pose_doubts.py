@@ -83,10 +83,7 @@ def desks(gap):
     tops = [
         floating_box(ROOM.terrain, sign * x, sign * y, (*size, 0.04), 0.7)
         for sign in (-1.0, 1.0)
-        for x, y, size in (
-            (0.5 * gap + 1.5, 0.0, (3.0, 8.0)),
-            (0.0, 0.5 * gap + 1.5, (gap, 3.0)),
-        )
+        for x, y, size in ((0.5 * gap + 1.5, 0.0, (3.0, 8.0)), (0.0, 0.5 * gap + 1.5, (gap, 3.0)))
     ]
     return Scene('desks', ROOM.terrain, (*ROOM.solids, *tops))
 

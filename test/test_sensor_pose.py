@@ -16,10 +16,7 @@ from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.jit import JIT_ENABLED
 from gp_ground_seg.core.pipeline.points import angles_of, rotate, rotation
-from gp_ground_seg.core.pipeline.sensor_pose import (
-    CLEAR_TILT,
-    DEFAULT_HEIGHT,
-)
+from gp_ground_seg.core.pipeline.sensor_pose import CLEAR_TILT, DEFAULT_HEIGHT
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.lab import simulation
 from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, SCENES, VLP_16, Scene, simulate_scan

@@ -30,16 +30,10 @@ TERRAINS = {
     'rough': landforms.rough(np.random.default_rng(3), rms=0.2, wavelengths=(0.7, 9.0)),
     'road_then_rubble': landforms.smooth_then_rough(np.random.default_rng(4), 9.0, 3.0),
     'rough_kerb': landforms.Sum(
-        (
-            landforms.kerb(4.0, 0.15),
-            landforms.rough(np.random.default_rng(5), 0.1, (0.7, 9.0)),
-        )
+        (landforms.kerb(4.0, 0.15), landforms.rough(np.random.default_rng(5), 0.1, (0.7, 9.0)))
     ),
     'ditch_across_crest': landforms.Sum(
-        (
-            landforms.ditch(1.3, 8.0, 4.0, 1.5, 1.0),
-            landforms.crest(8.0, 10.0, 0.1, 6.0),
-        )
+        (landforms.ditch(1.3, 8.0, 4.0, 1.5, 1.0), landforms.crest(8.0, 10.0, 0.1, 6.0))
     ),
 }
 

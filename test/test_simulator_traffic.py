@@ -26,7 +26,6 @@ EXACT = replace(HDL_64E, n_columns=700, range_std=0.0, dropout=0.0)
 TALL = replace(EXACT, elevations=SENSORS['os1-128'].elevations)
 FLAT = flat()
 BARE = Scene('bare', FLAT)
-OF_OBJECTS = (Kind.BOX, Kind.PERSON, Kind.CYCLIST)
 
 
 def in_world(made):
