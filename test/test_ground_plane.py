@@ -97,23 +97,6 @@ def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
         assert a.n_support <= a.n_cells <= N_SECTORS * ground_plane.N_RINGS
 
 
-def test_a_lowest_point_alone_is_left_out():
-    """Of one cell: noise below the ground, or a few points, all alone."""
-
-    def lowest(z):
-        r = np.linspace(10.0, 11.0, len(z))
-        zero, number = np.zeros(len(z), np.int64), np.zeros(len(z))
-        one = Candidates(r, np.array(z), zero, number, np.array([0, len(z)]), zero, r, number)
-        assert all(backend.fit_plane(one, 0.5, ORIGIN) is None for backend in BACKENDS)
-        cells = ground_plane.lowest_points(one)
-        assert cells.lowest_z == min(z)
-        return cells.z
-
-    assert lowest([-1.0, -2.5, -1.1, -1.05, -0.4]) == -1.1
-    assert lowest([-1.0, -2.5, -1.1, -2.4, -1.05, -0.4]) == -1.1
-    assert lowest([-1.0, -2.5, -0.2]) == -2.5
-
-
 def test_floor_at_the_foot_of_a_wall_lies_on_the_plane_of_the_floor():
     """Of its cells, one point is floor, and nine are wall."""
     m, r = (

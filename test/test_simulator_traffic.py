@@ -10,7 +10,6 @@ from conftest import scene_of, simulated
 
 from gp_ground_seg.lab.simulation import (
     HDL_64E,
-    LOW,
     PLACES,
     SCENES,
     SENSORS,
@@ -156,22 +155,6 @@ def test_every_scene_has_its_measures(name):
         assert np.median(degrees) >= usual and 0.35 * steepest <= degrees.max() <= steepest
     if name in ('hidden_climb', 'blind_slope'):  # level at the sensor
         assert not scene.terrain.gradient(np.zeros((1, 2))).any()
-
-
-@pytest.mark.parametrize('name', LOW)
-def test_low_things_are_in_plain_view_and_have_tops(name):
-    """Each alone on the ground has the returns that it has among the others."""
-    seed = 1
-    scene, made = scene_of(name, seed), simulated(name, TALL, seed)
-    x, y, z = in_world(made).T
-    reach = np.hypot(x, y)
-    assert reach[made.object_id > 0].min() > 3.0 and len(set(made.object_id)) > 4
-    for number, solid in enumerate(scene.solids[:4], 1):
-        assert reach[made.object_id == number].min(initial=20.0) < 20.2
-        alone = simulated(Scene('one', scene.terrain, (solid,)), TALL, seed)
-        assert (alone.object_id == 1).sum() == (made.object_id == number).sum()
-    tops = np.array([np.nan, *(solid.top for solid in scene.solids)])[made.object_id]
-    assert (np.abs(z - tops) < 1e-4).sum() > 50
 
 
 def test_the_height_of_an_object_is_that_of_its_highest_part_above_the_ground():
