@@ -20,6 +20,7 @@ from test_sensor_pose import (
 )
 
 from gp_ground_seg import Config, ConfigError, Label
+from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.core.pipeline import low_sensor
 from gp_ground_seg.core.pipeline.sensor_pose import (
     CLEAR_TILT,
@@ -32,44 +33,33 @@ from gp_ground_seg.lab.simulation import SCENES, Scene, simulate_scan
 from gp_ground_seg.lab.simulation import terrain as landforms
 from gp_ground_seg.lab.simulation.objects import floating_box
 
+GATES = 'growth.max_std', 'growth.seed_height_tolerance', 'label.obstacle_min_height'
+
 
 def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicle():
     config, reference = Config(), low_sensor.REFERENCE_HEIGHT
-    for height, lift, expected in (
-        (0.6, 0.0, 0.6),
-        (0.15, 0.0, 0.15),
-        (1.73, 0.0, reference),
-        (1.73, 1.53, reference),
-        (1.73, 1.73, reference),
-    ):
+    mounts = (0.6, 0.0, 0.6), (0.15, 0.0, 0.15), *((1.73, z, reference) for z in (0.0, 1.53, 1.73))
+    for height, lift, expected in mounts:
         pose = pose_of(moved(scan_of('kerb', SMALL_VLP, height).points, lift))
-        assert low_sensor.sensor_height_of(pose, config.sensor) == pytest.approx(
-            expected, abs=0.04
-        )
+        found = low_sensor.sensor_height_of(pose, config.sensor)
+        assert found == pytest.approx(expected, abs=0.04)
         own, share = low_sensor.for_sensor(config, pose, config.sensor), expected / reference
         if share == 1.0:
             assert own is config
             continue
-        assert own.growth.max_std == pytest.approx(0.35 * share, rel=0.3)
-        assert own.growth.seed_height_tolerance == pytest.approx(0.45 * share, rel=0.3)
-        assert own.label.obstacle_min_height == pytest.approx(0.2 * share, rel=0.3)
+        for name in GATES:
+            assert own[name] == pytest.approx(share * config[name], rel=0.3)
         least = max(0.1 * share, low_sensor.LEAST_TOLERANCE)
         assert own.label.ground_tolerance == pytest.approx(least, abs=0.005)
         # A smaller one that is given stays, and the paper's rule knows no height of the sensor.
         fine = config.replace(**{'label.ground_tolerance': 0.02})
         assert low_sensor.for_sensor(fine, pose, fine.sensor).label.ground_tolerance == 0.02
-        # What is at its least already is not refused.
-        least_of_all = {
-            'growth.max_std': 0.001,
-            'growth.seed_height_tolerance': 0.01,
-            'label.obstacle_min_height': 0.01,
-            'label.ground_tolerance': 0.001,
-        }
-        tiny = Config().replace(**least_of_all)
-        found = low_sensor.for_sensor(tiny, pose, tiny.sensor)
-        assert {name: found[name] for name in least_of_all} == least_of_all
         paper = config.replace(**{'label.rule': 'tolerance'})
         assert low_sensor.for_sensor(paper, pose, paper.sensor) is paper
+        # What is at its least already is not refused.
+        names = (*GATES, 'label.ground_tolerance')
+        tiny = config.replace(**{name: find_spec(name).minimum for name in names})
+        assert low_sensor.for_sensor(tiny, pose, tiny.sensor) == tiny
     # The sensor is where the origin is given to be.
     points = moved(scan_of('kerb', SMALL_VLP, 0.15).points, 0.15)
     given = dataclasses.replace(config.sensor, origin_z=0.15)
