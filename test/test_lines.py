@@ -103,7 +103,7 @@ def draw_faces(seed):
     st.sampled_from([1.0, 2.5, 3.0, 10.0]),
     st.floats(0.2, 5.0),
     st.sampled_from(['factor', 'classes']),
-    st.sampled_from([(1.0, 4, 3.0, 8.0), (0.2, 3, 9.0, 1.5), (10.0, 7, 99.0, 100.0)]),
+    st.sampled_from([(1.0, 4, 3.0, 8.0), (0.2, 3, 9.0, 1.5), (10.0, 7, 1.0, 100.0)]),
 )
 def test_lines_and_pseudo_inputs_are_the_reference(
     backend, seed, per, error_ratio, shared, bounds
@@ -158,6 +158,17 @@ def slope_at_16_m(rise, step=0.0):
 )
 def test_a_slope_starts_at_a_break_and_a_step_does_not(backend, rise, step, at_break):
     assert breaks(backend, *slope_at_16_m(rise, step)) == ([0, 6, 9], [False, at_break])
+
+
+def test_lines_that_are_short_or_steep_or_of_two_candidates_start_at_no_break(backend):
+    assert breaks(backend, *slope_at_16_m(0.3), max_line_slope=1.0)[1] == [False, True]
+    r, z = slope_at_16_m(0.12)
+    assert breaks(backend, r, z, min_bend_extent=21.0)[1] == [False, False]
+    assert breaks(backend, r, z, max_line_slope=0.1)[1] == [False, False]
+    few = breaks(backend, r[:-1], z[:-1], min_bend_extent=1.0)
+    assert few == ([0, 6, 8], [False, False])
+    # The line before must lie in the same segment.
+    assert breaks(backend, r, z, offsets=[0, 6, 9])[1] == [False, False]
 
 
 def test_a_candidate_far_below_moves_no_slope_break_of_other_segments(backend):
