@@ -1,7 +1,5 @@
 """Small bags of every kind, for the tests."""
 
-import sqlite3
-
 import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -108,18 +106,3 @@ def write_ros1_bag(path, n_clouds=3, topic='/kitti/velo/pointcloud', extras=True
                 text(time + 2, f'{k} 2')
                 again(time + 3, f'{k} 3')
                 distance(time + 4, header, 1, 0.1, 0.2, 30.0, 1.0 + k)
-
-
-def write_old_bag(path, types):
-    """A bag of Foxy's time: no definitions, no hashes."""
-    with sqlite3.connect(path) as connection:
-        connection.executescript(
-            'CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,'
-            ' serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL);'
-            'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,'
-            ' timestamp INTEGER NOT NULL, data BLOB NOT NULL);'
-        )
-        for k, (name, (msgtype, raw)) in enumerate(types.items()):
-            connection.execute('INSERT INTO topics VALUES(?, ?, ?, "cdr", "")', (k, name, msgtype))
-            connection.execute('INSERT INTO messages VALUES(?, ?, ?, ?)', (k, k, 1000 + k, raw))
-    connection.close()

@@ -473,7 +473,7 @@ CASES |= {
     'json_topic': (
         folder(
             lambda text: text.replace(CLOUDS, CLOUDS + TOPIC.format('/a', 'A', 'json', '', 0)),
-            topics=(('/points', CLOUD, 'cdr'), ('/a', 'A', 'json')),
+            topics=(('/points', CLOUD, 'cdr'), ('/a', 'A', 'json'), ('/b', 'b/msg/B', 'cdr')),
         ),
         THREE,
     ),

@@ -76,14 +76,6 @@ def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
         assert bag.deserialize(raw, POINT_CLOUD2).header.frame_id == 'velo_link'
 
 
-def test_bags_without_definitions_are_read(tmp_path):
-    raw = encode_cloud(samples.cloud(0))
-    contents = {'/points': (POINT_CLOUD2, raw), '/secret': ('my_msgs/msg/Unheard', b'\0\1\0\0abc')}
-    samples.write_old_bag(tmp_path / 'old.db3', contents)
-    expected = [('/points', 1000, raw), ('/secret', 1001, b'\0\1\0\0abc')]
-    assert read_all(tmp_path / 'old.db3') == expected
-
-
 @pytest.mark.parametrize('storage', ['MCAP', 'SQLITE3'])
 @pytest.mark.parametrize('mode', ['FILE', 'MESSAGE'])
 def test_packed_bags_are_read(tmp_path, storage, mode):

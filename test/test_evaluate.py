@@ -386,6 +386,7 @@ def test_settings_change_the_result_and_are_said(root, evaluated, tmp_path, caps
         (['--set', 'label.ground_tolerence=1'], 'label.ground_tolerance'),
         (['--json', '/no/such/folder/x.json'], '/no/such/folder'),
         (['--json', 'MINE'], '--force replaces it'),
+        *(([f'--cut={n}'], 'must be a number, at least 0') for n in ('-0.1', 'nan', 'low')),
         (
             ['--set', 'sensor.height=0', '--peer', 'patchworkpp'],
             'sensor.height = 0 set sensor.origin_z above 0',
@@ -401,12 +402,6 @@ def test_errors_are_said_before_any_frame_is_read(
     assert run('evaluate', root, *(mine if word == 'MINE' else word for word in words)) == 2
     assert message in error_line(capsys)
     assert mine.read_text() == 'mine'
-
-
-@pytest.mark.parametrize('cut', ['-0.1', 'nan', 'low'])
-def test_a_height_of_the_cut_is_a_number_from_0_on(root, cut, capsys):
-    assert run('evaluate', root, f'--cut={cut}') == 2
-    assert 'must be a number, at least 0' in error_line(capsys)
 
 
 def test_frames_without_a_scored_point_and_a_root_without_sequences(tmp_path, capsys):

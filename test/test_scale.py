@@ -58,37 +58,24 @@ def everything(path):
     return document
 
 
-@pytest.fixture
-def assert_same(scheduler, tmp_path, capsys):
-    """Run a command here, in processes and on a cluster: equal reports to the last digit."""
-
-    def compare(said, *words):
-        assert run(*words, '--json', tmp_path / 'here.json') == 0
-        assert said not in capsys.readouterr().out
-        for more in ('--workers', '2'), ('--scheduler', scheduler):
-            assert run(*words, '--json', tmp_path / 'there.json', '--force', *more) == 0
-            assert everything(tmp_path / 'there.json') == everything(tmp_path / 'here.json')
-            assert said in capsys.readouterr().out
-
-    return compare
+SAME = {
+    'evaluate ROOT': ', 2 workers beside one another  [ms]',
+    'evaluate ROOT --peer patchworkpp': ', 2 workers beside one another  [ms]',
+    'experiment ablation ROOT': 'workers with 2 threads in all',
+    'experiment objects --sensors vlp-16 --scenes urban,car_park --seeds 1': '2 threads in all',
+}
 
 
-@pytest.mark.parametrize('more', [[], ['--peer', 'patchworkpp']])
-def test_an_evaluation_is_the_same_to_the_last_digit(root, assert_same, more):
-    assert_same(', 2 workers beside one another  [ms]', 'evaluate', root, *more)
-
-
-@pytest.mark.parametrize(
-    'words',
-    [
-        ['ablation'],
-        ['objects', '--sensors', 'vlp-16', '--scenes', 'urban,car_park', '--seeds', '1'],
-    ],
-    ids=lambda words: words[0],
-)
-def test_an_experiment_is_the_same_to_the_last_digit(words, root, assert_same):
-    given = [root] if len(words) == 1 else []
-    assert_same('workers with 2 threads in all', 'experiment', *words, *given)
+@pytest.mark.parametrize('line', SAME)
+def test_reports_are_the_same_to_the_last_digit(line, root, scheduler, tmp_path, capsys):
+    """Here, in processes and on a cluster."""
+    words = [root if word == 'ROOT' else word for word in line.split()]
+    assert run(*words, '--json', tmp_path / 'here.json') == 0
+    assert SAME[line] not in capsys.readouterr().out
+    for more in ('--workers', '2'), ('--scheduler', scheduler):
+        assert run(*words, '--json', tmp_path / 'there.json', '--force', *more) == 0
+        assert everything(tmp_path / 'there.json') == everything(tmp_path / 'here.json')
+        assert SAME[line] in capsys.readouterr().out
 
 
 def test_labels_are_the_same_with_any_number_of_workers(root, scheduler, tmp_path, capsys):
