@@ -110,6 +110,22 @@ def test_the_oracle_is_the_conditional_of_the_joint_gaussian(seed, n, slope_std)
     np.testing.assert_allclose(found, mean + conditional(latent, values - mean)[0], atol=1e-9)
 
 
+@pytest.mark.parametrize(('rule', 'n_shown'), [('roughness', 1), ('tolerance', 3)])
+def test_candidates_close_together_show_as_much_as_one(backend, rule, n_shown):
+    config = config_of('constant', slope_std=0.0).replace(
+        **{'length_scale.constant': 50.0, 'label.rule': rule}
+    )
+    sigma_f, sigma_n = np.exp(given_theta(config)[:2])
+    for r, n in ([4.0, 4.75, 5.5], n_shown), ([4.0, 8.0, 12.0], 3):
+        r = np.array(r)
+        frame = frame_of(np.column_stack([r, 0.01 * r, np.full(3, -1.73)]), config)
+        surface, *_ = backend.estimate_surface(frame, given_theta(config), config)
+        assert surface.inlier.all() and len(surface.inlier) == 3
+        expected = (1.0 / sigma_f**2 + n / sigma_n**2) ** -0.5
+        std = surface.std[frame.candidates.segment[0]]
+        assert np.nanmin(std) == pytest.approx(expected, rel=0.02)
+
+
 def test_rounding_beside_little_noise_is_no_fault(backend):
     config = config_of('constant', slope_std=2.0).replace(
         **{
@@ -218,3 +234,13 @@ def test_the_odds_of_an_obstacle_are_those_of_the_frame(n_walls):
     stands = frame.candidates.z > -1.0
     odds = seeds(frame, given_theta(config), config)[1]
     assert odds == pytest.approx(max(stands.sum() / (~stands).sum(), ODDS), rel=0.02)
+
+
+def test_among_many_obstacles_sills_lift_less(backend):
+    def lifted(n_walls):
+        frame, config = frame_of_a_sill(n_walls)
+        config = config.replace(**{'observation.sigma_f': 0.35})
+        surface = backend.estimate_surface(frame, given_theta(config), config)[0]
+        return surface.mean[135, np.searchsorted(frame.knots, 8.0)] + 1.73
+
+    assert lifted(85) < 0.7 * lifted(0)
