@@ -233,11 +233,10 @@ def test_a_slope_nearby_is_not_the_ground_of_the_robot(sensor, scene):
 
 def test_what_is_not_levelled_has_the_height_of_a_level_plane():
     """Hills of which no plane has enough to tell the tilt."""
-    found = [pose_of(scan_of('hills', SMALL_OS1, 1.75, seed=seed).points) for seed in range(6)]
-    untold = [pose.measured.plane for pose in found if not pose.measured.tells_tilt]
-    assert untold
-    for plane in untold:
-        assert math.hypot(plane.slope_x, plane.slope_y) <= 1.1 * math.tan(CLEAR_TILT)
+    for seed in (4, 5):
+        measured = pose_of(scan_of('hills', SMALL_OS1, 1.75, seed=seed).points).measured
+        slope = math.hypot(measured.plane.slope_x, measured.plane.slope_y)
+        assert not measured.tells_tilt and slope <= 1.1 * math.tan(CLEAR_TILT)
 
 
 @SENSORS
