@@ -244,6 +244,16 @@ def test_neighbours_must_agree(lower, expected):
         assert set((turn * SECTORS).astype(int)) == set(expected)
 
 
+@pytest.mark.parametrize(('r', 'slope', 'is_hidden'), [(9.0, 0.212, True), (13.0, 0.17, False)])
+def test_what_stands_in_the_line_of_sight_hides_the_lower_ground(r, slope, is_hidden):
+    """Between the last ring before the edge and the first behind it, or behind both."""
+    xyz, is_ground, stands = level_scan(lower := range(100, 110))
+    things = [[r * np.cos(a), r * np.sin(a), -slope * r] for a in MIDDLE[lower]]
+    masks = np.append(is_ground, np.zeros(10, bool)), np.append(stands, np.ones(10, bool))
+    edges = find_edges(np.concatenate([xyz, things]), *masks, MAX_STEP_DOWN)
+    assert (np.isinf(edges.r[lower]) == is_hidden).all()
+
+
 def test_order_and_strange_points_do_not_matter():
     xyz, is_ground, stands = level_scan(range(50, 70))
     expected = find_edges(xyz, is_ground, stands, MAX_STEP_DOWN)
