@@ -52,9 +52,9 @@ def test_a_misspelt_command_is_one_line(word, hint, capsys):
          '{near --ros-args --params-file}'),
         ('demo --ros-args -r a:=b', 'demo: --ros-args: this command takes none'),
         ('config dump -p a', 'config dump: unrecognized arguments: -p a; {help config dump}'),
-        ('config dmp', "config: WHAT: 'dmp': must be one of dump, check; {near dump}"),
-        ('config my.yaml', 'config: my.yaml: no WHAT; {near gp-ground-seg config check my.yaml}'),
-        ('plot a.pcd -o b', 'plot: a.pcd: no PICTURE; {near gp-ground-seg plot scan a.pcd}'),
+        ('config dmp', "config: 'dmp': must be one of dump, check; {near dump}"),
+        ('config a.yaml', 'config: a.yaml: no command; {near gp-ground-seg config check a.yaml}'),
+        ('plot a.pcd -o b', 'plot: a.pcd: no command; {near gp-ground-seg plot scan a.pcd}'),
         ('evaluate R --sequences 00 08', 'evaluate: unrecognized arguments: 08; '
          'the list must be without spaces, as in --sequences 00,08'),
         ('plot segment A -o B --seg 1 2 3', 'plot segment: unrecognized arguments: 2 3; '
@@ -120,9 +120,7 @@ def test_a_url_is_refused_with_what_to_use_instead(line, capsys):
 
 def parsers_below(parser):
     """Parsers of a command that have none below them, as words of the command line."""
-    below = [one.choices for one in parser._actions if isinstance(one.choices, dict)]
-    names = [leaf for one in below for leaf in one.values() if isinstance(leaf, type(parser))]
-    return [leaf for one in names for leaf in parsers_below(one)] or [parser]
+    return [leaf for one in parser.commands.values() for leaf in parsers_below(one)] or [parser]
 
 
 @pytest.mark.parametrize('name', cli.COMMANDS)

@@ -89,8 +89,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--against', 'compare with this parameter file or preset', {'metavar': 'NAME'}),
         (
             '--peer',
-            'compare with this method (pip install pypatchworkpp)',
-            {'choices': [PATCHWORKPP]},
+            f'compare with this method: {PATCHWORKPP} (pip install pypatchworkpp)',
+            {'type': options.one_of([PATCHWORKPP]), 'metavar': 'METHOD'},
         ),
         options.MARKDOWN,
         options.TO_JSON,

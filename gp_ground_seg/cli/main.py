@@ -74,6 +74,23 @@ def _grouped_commands() -> str:
 class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, the same with every version of Python."""
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.options: dict[str, argparse.Action] = {}
+        self.commands: dict[str, argparse.ArgumentParser] = {}
+        super().__init__(*args, **kwargs)
+
+    def add_argument(self, *args: Any, **kwargs: Any) -> argparse.Action:
+        """Note the names of an option."""
+        action = super().add_argument(*args, **kwargs)
+        self.options.update(dict.fromkeys(action.option_strings, action))
+        return action
+
+    def add_subparsers(self, **kwargs: Any) -> Any:
+        """Note the commands below this one."""
+        subparsers = super().add_subparsers(**kwargs)
+        self.commands = subparsers.choices
+        return subparsers
+
     def error(self, message: str) -> NoReturn:
         """Raise a GroundSegError, which names the help if the message has no next step."""
         has_step = 'must be' in message or 'did you mean' in message
@@ -81,31 +98,30 @@ class _Parser(argparse.ArgumentParser):
         hint = '' if has_step else f'; {self.prog} --help lists what it takes'
         raise GroundSegError(': '.join(filter(None, parts)) + hint)
 
-    def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Refuse a word that is none of the choices."""
-        if action.choices is None or value in action.choices:
-            return
-        file_command = FILE_COMMANDS.get(self.prog.split()[-1])
-        if file_command and (Path(value).suffix or Path(value).exists()):
-            hint = f'did you mean {self.prog} {file_command} {value}?'
-            raise argparse.ArgumentError(None, f'{value}: no {action.metavar}; {hint}')
-        names = [str(choice) for choice in action.choices]
-        message = f'{value!r}: must be one of {", ".join(names)}{did_you_mean(value, names)}'
-        raise argparse.ArgumentError(action, message)
-
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Refuse, in the parser of the last command, what it does not take."""
+        """Refuse what is no command, and, in the parser of the last one, what it does not take."""
+        command = next((word for word in args if not word.startswith('-')), '')
+        if self.commands and command not in ('', *self.commands):
+            self._refuse_command(command)
         arguments, unknown = super().parse_known_args(args, namespace)
-        if unknown and not any(isinstance(a.choices, dict) for a in self._actions):
+        if unknown and not self.commands:
             hint = self._hint_at(unknown[0], args)
             self.error(f'unrecognized arguments: {" ".join(unknown)}{hint}')
         return arguments, unknown
+
+    def _refuse_command(self, word: str) -> NoReturn:
+        """Say which command below this one a word may mean that is none."""
+        file_command = FILE_COMMANDS.get(self.prog.split()[-1])
+        if file_command and (Path(word).suffix or Path(word).exists()):
+            self.error(f'{word}: no command; did you mean {self.prog} {file_command} {word}?')
+        names = ', '.join(self.commands)
+        self.error(f'{word!r}: must be one of {names}{did_you_mean(word, self.commands)}')
 
     def _hint_at(self, word: str, words: Sequence[str]) -> str:
         """Say what may be meant by one of the words, which is not taken."""
         if word in OF_ROS and self.get_default('accepts_ros_args'):
             return f'; did you mean {ROS_ARGS} {word}?'
-        options = {name: action for action in self._actions for name in action.option_strings}
+        options = self.options
         if word.startswith('-'):
             return did_you_mean(word.partition('=')[0], options) if word[1:2] == '-' else ''
         # Of a list with spaces only the first word belongs to its option.

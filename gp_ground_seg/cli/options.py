@@ -52,7 +52,7 @@ def new_parser(
     )
 
 
-def add(parser: argparse._ActionsContainer, *options: tuple[str, str, dict[str, Any]]) -> None:
+def add(parser: argparse.ArgumentParser, *options: tuple[str, str, dict[str, Any]]) -> None:
     """Add options: names, help, and what else `add_argument` takes."""
     for names, text, more in options:
         parser.add_argument(*names.split(), help=text, **more)
@@ -104,7 +104,7 @@ def refuse_columns(arguments: argparse.Namespace, source: object) -> None:
         raise DataError(f'--columns: is for .bin scans, which {source} is not')
 
 
-def add_cluster(parser: argparse._ActionsContainer) -> None:
+def add_cluster(parser: argparse.ArgumentParser) -> None:
     """Add ``--workers N`` and ``--scheduler ADDRESS``."""
     add(
         parser,
@@ -135,6 +135,19 @@ def above_zero(text: str, *, or_zero: bool = False) -> float:
         least = 'at least 0' if or_zero else 'above 0'
         raise argparse.ArgumentTypeError(f'{text!r}: must be a number, {least}')
     return number
+
+
+def one_of(known: Iterable[str]) -> Callable[[str], str]:
+    """Return the type of one of the `known` names."""
+    names = list(known)
+
+    def parse(word: str) -> str:
+        if word not in names:
+            hint = did_you_mean(word, names)
+            raise argparse.ArgumentTypeError(f'{word!r}: must be one of {", ".join(names)}{hint}')
+        return word
+
+    return parse
 
 
 def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:

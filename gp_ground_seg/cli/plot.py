@@ -95,7 +95,7 @@ def _declare_scan(parser: argparse.ArgumentParser) -> None:
 
 def _declare_segment(parser: argparse.ArgumentParser) -> None:
     options.add(
-        parser.add_mutually_exclusive_group(required=True),
+        parser,
         ('--segment', 'number of the segment, or of several side by side',
          {'metavar': 'N[,N]', 'type': _integers}),
         ('--azimuth', 'the segment in this direction, 90 = left',
@@ -110,6 +110,8 @@ def run(arguments: argparse.Namespace) -> int:
     if path.suffix.lower() not in KINDS:
         raise DataError(f'{path}: must end in {ENDINGS}')
     check_writable(path, force=arguments.force)
+    if arguments.picture == 'segment' and [arguments.segment, arguments.azimuth].count(None) != 1:
+        raise DataError('plot segment: must be given one of --segment and --azimuth')
     points, title = _read(arguments)
     truth = None
     if arguments.labels is not None:

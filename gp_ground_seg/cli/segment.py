@@ -74,7 +74,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
          {'metavar': 'OUT'}),
         ('--format', 'of the output (default: by the name of OUT, else labels of .bin scans, and '
          f'as the input; mcap for ROS 1): {", ".join(formats)}',
-         {'choices': formats, 'metavar': 'FORMAT'}),
+         {'type': options.one_of(formats), 'metavar': 'FORMAT'}),
         *options.CLOUDS,
         options.FORCE,
         options.QUIET,
