@@ -42,10 +42,7 @@ def reached_on_foot(candidates, faces, height, config):
 
     for a in sorted(allowed):
         if a + 1 < len(r) and segment[a + 1] == segment[a]:
-            if falls(r[a + 1] - r[a], z[a + 1] - z[a]):
-                if {a, a + 1} <= allowed:
-                    steep.append((a, a + 1))
-            elif r[a + 1] - r[a] > 1.0 + 0.12 * r[a + 1]:
+            if r[a + 1] - r[a] > 1.0 + 0.12 * r[a + 1]:
                 if {a, a + 1} <= allowed and goes_on(candidates, a):
                     steep.append((a, a + 1))
             else:
@@ -55,14 +52,11 @@ def reached_on_foot(candidates, faces, height, config):
             across = aside * 2.0 * math.pi / n_segments * r[a]
             for b in (*own[r[own] < r[a]][-1:], *own[r[own] >= r[a]][:1]):
                 step(a, int(b), 0.5 * (1.0 + 0.12 * r[a]), across)
-    up = {c: set(others) for c, others in beside.items()}
     for front in fronts_of(steep, r, z, segment, n_segments):
         if sum(2.0 * math.pi / n_segments * r[a] for a, _ in front) >= 6.0:
             for a, b in front:
-                is_fall = falls(r[b] - r[a], z[b] - z[a])
-                for steps in (beside,) if is_fall else (beside, up):
-                    steps[a].add(b)
-                    steps[b].add(a)
+                beside[a].add(b)
+                beside[b].add(a)
     groups = groups_of(allowed, lambda c: beside[c])
     seeds = {
         c
@@ -71,19 +65,14 @@ def reached_on_foot(candidates, faces, height, config):
     }
     reached = {c for group in groups if len(seeds & group) >= 8 for c in group}
     raised = {c for c in reached if z[c] + height > 0.3}
-    for part in groups_of(raised, lambda c: up[c] & raised):
-        entries = {c for c in part if up[c] & (reached - raised)}
+    for part in groups_of(raised, lambda c: beside[c] & raised):
+        entries = {c for c in part if beside[c] & (reached - raised)}
         nearest = {
             segment[c]: min(r[e] for e in entries if segment[e] == segment[c]) for c in entries
         }
         if sum(2.0 * math.pi / n_segments * r_entry for r_entry in nearest.values()) < 1.5:
             reached -= part
     return reached
-
-
-def falls(dr, rise):
-    """Whether a step along a segment leads down over an edge."""
-    return rise < -0.8 and rise < -0.06 * dr
 
 
 def goes_on(candidates, a):

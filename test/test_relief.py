@@ -51,14 +51,12 @@ def heights_of(relief):
 def test_relief_is_the_reference(backend, seed, n_segments, looks_aside):
     rng = np.random.default_rng(seed)
     steep, foot, turn, noise = rng.uniform((0.1, 5.0, -3.0, 0.0), (0.8, 15.0, 3.0, 0.1))
-    edge = rng.uniform(-4.0, 2.0)
 
     def land(x, y):
         along = x * math.cos(turn) + y * math.sin(turn)
         bank = np.clip(steep * (along - foot), 0.0, 3.0)
         thing = 1.5 * (rng.uniform(size=len(x)) < 0.05)
-        fall = np.where(along < -foot, min(edge, 0.0), 0.0)
-        return bank + fall + thing + noise * rng.normal(size=len(x))
+        return bank + thing + noise * rng.normal(size=len(x))
 
     ranges = np.sort(rng.uniform(2.0, 65.0, 24))
     candidates = candidates_on(land, ranges, n_segments, seed, share=0.7)
@@ -94,24 +92,6 @@ def test_the_relief_is_that_of_a_bank(backend, degrees):
     far = relief.at(np.array([45.0, 500.0]), np.array([0.0, 20.0]))
     np.testing.assert_allclose(far, 3.0 * side, atol=0.1)
     assert (relief.at(np.array([-30.0, 5.0]), np.zeros(2)) == 0.0).all()
-
-
-def test_land_behind_an_edge_is_land_and_what_it_is_seen_over_is_not(backend):
-    """Of a dike the land below is not seen up to its edge; of a hedge, all of what is behind."""
-    sparse = np.array([3.0, 4.0, 5.0, 6.0, 7.0, 14.0, 15.0, 16.0, 18.0, 20.0, 24.0, 30.0])
-
-    def dike(x, y):
-        return np.where(x > 7.5, -2.0, 0.0)
-
-    def hedge(x, y):
-        return np.where((x > 5.0) & (x < 8.0), 1.5, 0.0)
-
-    for land, expected in ((dike, -2.0), (hedge, 0.0)):
-        relief, _ = backend.find_relief(candidates_on(land, sparse), NO_FACES, HEIGHT, Config())
-        there = np.array([6.5, 18.0, 25.0]), np.zeros(3)
-        np.testing.assert_allclose(relief.at(*there)[1:], expected, atol=0.1)
-        if land is hedge:
-            assert relief.is_level
 
 
 def test_long_steps_go_on_with_the_slope_before(backend):

@@ -37,7 +37,6 @@ from gp_ground_seg.core.pipeline.relief import (
     arc_of,
     can_step,
     faded,
-    falls,
     from_first_middle,
     goes_on,
     height_in,
@@ -200,16 +199,16 @@ def _step_along(candidates: Candidates, allowed: BoolArray, walk: _Walk) -> IntA
     for m in range(len(offsets) - 1):
         for c in range(offsets[m] + 1, offsets[m + 1]):
             dr, rise = r[c] - r[c - 1], z[c] - z[c - 1]
-            if not (allowed[c] and allowed[c - 1]):
+            if not (allowed[c] and allowed[c - 1] and dr <= longest_gap(r[c])):
                 continue
             if dr > largest_gap(r[c]):
-                is_step = dr <= longest_gap(r[c]) and _goes_on(candidates, offsets[m], c)
+                is_taken = _goes_on(candidates, offsets[m], c)
             else:
-                is_step = can_step(dr, rise, STEEP)
-                if is_step and abs(rise) <= GENTLE:
+                is_taken = can_step(dr, rise, STEEP)
+                if is_taken and abs(rise) <= GENTLE:
                     _step(walk, c - 1, c)
                     continue
-            if is_step or falls(dr, rise):
+            if is_taken:
                 steep[n] = c
                 n += 1
     return steep[:n]
@@ -230,12 +229,8 @@ def _goes_on(candidates: Candidates, first: int, c: int) -> bool:
 
 @jit()
 def _step_up(candidates: Candidates, steep: IntArray, walk: _Walk) -> None:
-    """Take the steep and long steps in a front; `steep` (S,) are their far ends, in order.
-
-    One that falls is no way up.
-    """
-    r, z, offsets = candidates.r, candidates.z, candidates.offsets
-    n_segments = len(offsets) - 1
+    """Take the steep and long steps in a front; `steep` (S,) are their far ends, in order."""
+    offsets, n_segments = candidates.offsets, len(candidates.offsets) - 1
     starts, segment = np.zeros(n_segments + 1, np.int64), np.empty(len(steep), np.int64)
     k = 0
     for m in range(n_segments):
@@ -251,14 +246,10 @@ def _step_up(candidates: Candidates, steep: IntArray, walk: _Walk) -> None:
     width = np.zeros(len(steep))
     for k in range(len(steep)):
         front[k] = _root(front, k)
-        width[front[k]] += arc_of(r[steep[k] - 1], n_segments)
+        width[front[k]] += arc_of(candidates.r[steep[k] - 1], n_segments)
     for k in range(len(steep)):
         if width[front[k]] >= MIN_WIDTH:
-            near, far = steep[k] - 1, steep[k]
-            if falls(r[far] - r[near], z[far] - z[near]):
-                _join(walk.parent, near, far)
-            else:
-                _step(walk, near, far)
+            _step(walk, steep[k] - 1, steep[k])
 
 
 @jit()

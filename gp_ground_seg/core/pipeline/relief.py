@@ -42,9 +42,8 @@ long between segments."""
 MAX_SLOPE, STEP_TOLERANCE = 0.84, 0.06
 """Steepest step, of 40 degrees, and what it may rise beyond that by roughness and noise [m]."""
 GENTLE, STEEP, MIN_WIDTH = 0.3, 0.8, 6.0
-"""Largest rise or fall of a step; largest rise of one along a segment which is taken where others
-are side by side with it over a width, and this width: more than the length of a car [m]. In such a
-front a step may also fall by any height: nothing that stands on the land is below it."""
+"""Largest rise or fall of a step; that of one along a segment which is taken where others are side
+by side with it over a width, and this width: more than the length of a car [m]."""
 LONG_GROWTH, MIN_SLOPE, SAME_SLOPE = 0.4, 0.06, 0.08
 """Growth with range of the longest step along a segment that goes on with the slope of the land
 before it [m/m], in such a front too; least slope of one, and difference to that before."""
@@ -145,31 +144,23 @@ def reachable(candidates: Candidates, allowed: BoolArray, is_seed: BoolArray) ->
     taken &= ~is_along | (dr <= largest_gap(candidates.r[second]))
     wanting = np.flatnonzero(~taken)
     taken[wanting] = _in_front(candidates, first[wanting])
-    is_way_up = taken.copy()
-    rise = candidates.z[second[wanting]] - candidates.z[first[wanting]]
-    is_way_up[wanting] &= ~falls(dr[wanting], rise)
     group = _groups(len(allowed), first[taken], second[taken])
     reached = allowed & (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
-    return _entered(candidates, reached, first[taken], second[taken], is_way_up[taken])
+    return _entered(candidates, reached, first[taken], second[taken])
 
 
 def _entered(
-    candidates: Candidates,
-    reached: BoolArray,
-    first: IntArray,
-    second: IntArray,
-    is_way_up: BoolArray,
+    candidates: Candidates, reached: BoolArray, first: IntArray, second: IntArray
 ) -> BoolArray:
     """Candidates that are `reached`, without raised ones that few of the steps lead up to, (C,).
 
-    `first` and `second` (S,) are the ends of the steps, `is_way_up` those that can lead up. A
-    hillside is entered all along its foot, a car, if at all, where the step to a sill or a bonnet
-    happens to be gentle. What lies behind a hedge is below its top, which is no way up to that.
+    `first` and `second` (S,) are the ends of the steps. A hillside is entered all along its foot,
+    a car, if at all, where the step to a sill or a bonnet happens to be gentle.
     """
     is_raised, n_segments = reached & (candidates.z > RAISED), len(candidates.offsets) - 1
-    both = is_way_up & is_raised[first] & is_raised[second]
+    both = is_raised[first] & is_raised[second]
     part = _groups(len(reached), first[both], second[both])
-    leads_up = is_way_up & reached[first] & (is_raised[first] != is_raised[second])
+    leads_up = reached[first] & (is_raised[first] != is_raised[second])
     entries = np.unique(np.where(is_raised[first], first, second)[leads_up])
     # A segment with several entries counts once, by the nearest.
     key = part[entries] * n_segments + candidates.segment[entries]
@@ -236,7 +227,6 @@ def _steps(candidates: Candidates) -> tuple[IntArray, IntArray]:
         is_long = has_before & (dr <= longest_gap(r[1:])) & goes_on(rise / dr, slope_before)
     is_step = (dr <= largest_gap(r[1:])) & can_step(dr, rise, STEEP)
     is_step |= is_long & (dr > largest_gap(r[1:]))
-    is_step |= falls(dr, rise)
     is_step &= segment[1:] == segment[:-1]
     first, second = [along[is_step]], [along[is_step] + 1]
     for aside in range(1, N_ASIDE + 1):
@@ -270,12 +260,6 @@ def goes_on(slope: Values, before: Values) -> Values:
     """Whether a step of this slope goes on with that before it."""
     is_slope = (np.abs(slope) >= MIN_SLOPE) & (np.abs(slope) <= MAX_SLOPE)
     return is_slope & (np.abs(slope - before) <= SAME_SLOPE)
-
-
-@shared
-def falls(distance: Values, rise: Values) -> Values:
-    """Whether a step leads over an edge: down by more than a steep one, and than level land."""
-    return (rise < -STEEP) & (rise < -MIN_SLOPE * distance)
 
 
 @shared
