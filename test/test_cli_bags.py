@@ -3,8 +3,11 @@
 import contextlib
 import functools
 import itertools
+import os
 import re
 import signal
+import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -14,7 +17,6 @@ import ros_helpers as ros
 from bag_samples import PERIOD, START, write_ros1_bag, write_ros2_bag
 from cli_runner import PATIENCE, error_line, run, start, wait_for
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import isolated_context, spinning
 from rosgraph_msgs.msg import Clock
@@ -206,10 +208,26 @@ def test_loop_until_interrupted(tmp_path):
     assert np.median(steps) > 0.5 * PERIOD / 2
 
 
-def test_clouds_that_a_subscriber_does_not_acknowledge(tmp_path, capsys, monkeypatch):
-    """One that was killed cannot say goodbye: the middleware believes in it for a while."""
+SUBSCRIBER = """
+import os, rclpy, signal
+from sensor_msgs.msg import PointCloud2
+rclpy.init()
+node = rclpy.create_node('doomed')
+seen = []
+
+def receive(cloud):
+    seen.append(cloud)
+    if len(seen) == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+node.create_subscription(PointCloud2, '/points', receive, 10)
+rclpy.spin(node)
+"""
+
+
+def test_subscriber_that_is_killed(tmp_path, capsys, monkeypatch):
+    """It cannot say goodbye: the middleware believes in it, but no longer hears of it."""
     monkeypatch.setattr(playback, 'DELIVERY_TIMEOUT', 0.5)
-    monkeypatch.setattr(Publisher, 'wait_for_all_acked', lambda *_: False)
     send, sent = playback.Player._send, []
 
     def note(player, topic, raw):
@@ -217,8 +235,11 @@ def test_clouds_that_a_subscriber_does_not_acknowledge(tmp_path, capsys, monkeyp
         send(player, topic, raw)
 
     monkeypatch.setattr(playback.Player, '_send', note)
-    with listening('/points'):
-        assert play(drive(tmp_path, 2)) == 1
+    bag, command = drive(tmp_path, 20), [sys.executable, '-c', SUBSCRIBER]
+    environment = {**os.environ, **ros.ISOLATION}
+    with subprocess.Popen(command, env=environment) as subscriber, isolated_context():
+        assert play(bag) == 1
+        assert subscriber.wait(PATIENCE) == -signal.SIGKILL
     assert time.monotonic() - sent[-1] > 0.5
     said = capsys.readouterr().err.splitlines()[-1]
     assert said.endswith('not every reliable subscriber has acknowledged all clouds')

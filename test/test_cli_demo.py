@@ -22,7 +22,7 @@ from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
 from gp_ground_seg.ros import start_stop
-from gp_ground_seg.ros.node_process import NodeProcess
+from gp_ground_seg.ros.node_process import NodeProcess, private_session
 
 
 def sent_cloud(n=40, seed=0, stamp=5_000_000_007):
@@ -174,3 +174,11 @@ def test_no_profile_where_the_user_chose_or_shared_memory_is_short(no_profile, m
         assert profile_in_use() is None
     monkeypatch.setattr(start_stop, '_free_shared_memory', lambda: 64 << 20)
     assert profile_in_use() is None
+
+
+def test_each_session_has_a_namespace_of_its_own(rclpy):
+    names = []
+    for _ in range(2):
+        with private_session('link') as (session, _):
+            names.append(session.node.get_namespace())
+    assert names[0] != names[1] and '/' not in names

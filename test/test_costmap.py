@@ -13,6 +13,9 @@ from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.data import costmap
 from gp_ground_seg.data.costmap import DIRECTIONS, FREE, OCCUPIED, UNKNOWN, Placement
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, Kind, simulate_scan
+from gp_ground_seg.lab.simulation.objects import standing_box
+from gp_ground_seg.lab.simulation.scenes import Scene
+from gp_ground_seg.lab.simulation.terrain import flat
 
 BAND = {'output.min_height': 0.2, 'output.max_height': 2.0}
 
@@ -194,3 +197,30 @@ def test_a_plane_on_edge_is_no_map():
     segmented = Segmented(xyz, GroundSegmenter(config).segment(xyz), config)
     with pytest.raises(PointCloudError, match=r'output\.frame must be a level frame'):
         segmented.places(segmented.is_obstacle)
+
+
+@pytest.mark.parametrize('sensor', ['hdl-64e', 'os1-128', 'vlp-16'])
+def test_a_low_wall_is_in_the_way_in_every_direction(sensor):
+    # 0.4 m high and 12 m long, across the way: all of it is seen from 0.15 m over the ground on.
+    terrain = flat()
+    wall = standing_box(terrain, 6.0, 0.0, (0.3, 12.0, 0.4))
+    scan = simulate_scan(
+        Scene('wall', terrain, (wall,)), SENSORS[sensor], np.random.default_rng(1)
+    )
+    config = Config().replace(**{'output.min_height': 0.15})
+    xyz = scan.points[:, :3]
+    segmented = Segmented(xyz, GroundSegmenter(config).segment(xyz), config)
+    returns = tuple(segmented.points.T[:2])
+    found = costmap.scan_ranges(segmented.places(segmented.is_obstacle), returns)
+    # Each direction in the middle of which the wall lies.
+    middle = (np.arange(DIRECTIONS) + 0.5) * 2.0 * np.pi / DIRECTIONS - np.pi
+    towards = abs(np.tan(middle)) < 5.8 / 5.85
+    towards &= np.cos(middle) > 0.0
+    assert abs(found[towards] * np.cos(middle[towards]) - 5.85).max() < 0.2
+    rows = np.flatnonzero((occupancy_of(segmented) == OCCUPIED).any(axis=1))
+    cells = np.unique(
+        np.floor(xyz[~scan.is_ground & (scan.points[:, 2] > scan.ground_z + 0.2), 1] / 0.1)
+    )
+    assert set(cells.astype(int) + 200) <= set(rows.tolist())
+    # None of the ground is.
+    assert not (segmented.is_obstacle & scan.is_ground).any()

@@ -1,6 +1,7 @@
 """The package as a whole: versions, layers, dependencies."""
 
 import ast
+import os
 import re
 import shlex
 import shutil
@@ -179,3 +180,22 @@ def test_a_hint_says_where_pip_works(tmp_path, monkeypatch):
     assert install_hint('rosbags') == there
     monkeypatch.setattr(sys, 'prefix', '/elsewhere')
     assert install_hint('rosbags') == here
+
+
+def test_a_warning_is_an_error_in_tests_and_not_where_plugins_are_imported(tmp_path):
+    """One of launch_testing ended ``colcon test`` before the first test."""
+    found = tmp_path / 'early-1.0.dist-info'
+    found.mkdir()
+    (found / 'METADATA').write_text('Metadata-Version: 2.1\nName: early\nVersion: 1.0\n')
+    (found / 'entry_points.txt').write_text('[pytest11]\nearly = early\n')
+    warn = "import warnings\n{}warnings.warn('{}', DeprecationWarning)\n"
+    (tmp_path / 'early.py').write_text(warn.format('', 'early'))
+    (tmp_path / 'test_late.py').write_text(warn.format('def test_late(): ', 'late'))
+    words = '-c', REPOSITORY / 'pyproject.toml', '-p', 'conftest', tmp_path / 'test_late.py'
+    path = os.pathsep.join(map(str, [tmp_path, REPOSITORY / 'test', *sys.path]))
+    done = subprocess.run(
+        [sys.executable, '-m', 'pytest', *words], capture_output=True, text=True,
+        # The options that colcon passes so name modules: of this one, for ever.
+        env={**os.environ, 'PYTHONPATH': path, 'NUMBA_DISABLE_JIT': '1', 'PYTEST_ADDOPTS': ''},
+    )  # fmt: skip
+    assert done.returncode == 1 and 'DeprecationWarning: late' in done.stdout, done.stderr

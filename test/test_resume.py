@@ -217,13 +217,15 @@ def test_a_run_that_was_killed_goes_on_and_nothing_is_done_twice(root, tmp_path,
 
 @pytest.mark.slow
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
-def test_all_processes_end_with_a_run_that_is_stopped(tmp_path, number):
+def test_all_processes_end_with_a_run_that_is_stopped_and_nothing_is_lost(
+    tmp_path, capsys, number
+):
     root, record = write_streets(tmp_path / 'root', s00=1), tmp_path / 'out/outputs.jsonl'
     scan, *_ = root.rglob('*.bin')
     for k in range(1, 600):
         scan.with_name(f'{k:06d}.bin').hardlink_to(scan)
-    words = 'segment', root, '-o', record.parent, '--workers', '2'
-    process = start(*words, start_new_session=True)
+    words = 'segment', root, '-o', record.parent
+    process = start(*words, '--workers', '2', start_new_session=True)
     # The first line is of what is to be written.
     wait_for(lambda: record.exists() and record.read_bytes().count(b'\n') >= 2, 'two lines')
     workers = children(process.pid)
@@ -232,9 +234,23 @@ def test_all_processes_end_with_a_run_that_is_stopped(tmp_path, number):
         assert process.communicate() == ('', 'gp-ground-seg: interrupted\n')
         assert process.returncode in INTERRUPTED
     else:
+        os.kill(workers[-1], signal.SIGKILL)
+        wait_for(lambda: record.read_bytes().count(b'\n') >= 5, 'three more lines')
+        workers += children(process.pid)
         process.kill()
-        assert 'Traceback' not in process.communicate()[1]
+        said = process.communicate()[1]
+        assert 'a worker died; computed again: ' in said and 'Traceback' not in said
     wait_for(lambda: not any(map(is_running, workers)), 'end of all processes')
+    out, before = record.parent, finished(record.parent)
+    times = {name: (out / name).stat().st_mtime_ns for name in before}
+    assert 0 < len(before) < 600
+    assert run(*words) == 0
+    assert f'{len(before)} of 600 were finished before' in capsys.readouterr().out
+    assert {name: (out / name).stat().st_mtime_ns for name in before} == times
+    found = label_files(out)
+    assert sorted(finished(out)) == sorted(found) and len(found) == 600
+    assert len(set(found.values())) == 1
+    assert len(list((out / 'sequences/00/predictions').iterdir())) == 600
 
 
 def test_a_folder_of_that_name_is_kept(tmp_path):

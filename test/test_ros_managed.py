@@ -98,7 +98,7 @@ def test_a_lifecycle_manager_hears_a_bond_while_the_node_is_active(tmp_path):
             instances.append({one.instance_id for one in heard.messages})
             times = [one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec for one in beats]
             # Nav2's manager waits half of its bond_timeout for the first that it hears.
-            assert np.median(np.diff(times)) < 0.5
+            assert np.median(np.diff(times)) == pytest.approx(0.1, abs=0.05)
             assert end.heartbeat_period == pytest.approx(0.1) and end.heartbeat_timeout == 4.0
         (first,), (second,) = instances
         assert first != second
@@ -113,7 +113,7 @@ def test_impossible_transitions_are_refused_at_once(tmp_path):
     possible = {unconfigured: (1, 5), inactive: (3, 2, 6), active: (7, 4), finalized: ()}
     with managed_node(tmp_path) as (process, link):
         for state, numbers in possible.items():
-            for number in {*range(9), 10, 60, 61, 255}.difference(numbers):
+            for number in {*range(12), *range(60, 70), 99, 255}.difference(numbers):
                 start = time.monotonic()
                 assert change(link, number) == (False, state), (state, number)
                 assert time.monotonic() - start < 5.0

@@ -69,7 +69,7 @@ def test_values_of_every_type_are_answered(setter):
     """Also of those that do not exist, at which rclpy raises, and its callers wait for ever."""
     with ros.linked() as link:
         (message,) = ros.parameter_messages({'grid.r_max': 50.0})
-        for number in (*range(12), 127, 128, 255):
+        for number in range(256):
             message.value.type = number
             (result,) = link.request(setter, [message])
             assert result.successful == (number == ParameterType.PARAMETER_DOUBLE)

@@ -100,12 +100,13 @@ class _Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Refuse what is no command, and, in the parser of the last one, what it does not take."""
-        command = next((word for word in args if not word.startswith('-')), '')
+        words = sys.argv[1:] if args is None else args
+        command = next((word for word in words if not word.startswith('-')), '')
         if self.commands and command not in ('', *self.commands):
             self._refuse_command(command)
-        arguments, unknown = super().parse_known_args(args, namespace)
+        arguments, unknown = super().parse_known_args(words, namespace)
         if unknown and not self.commands:
-            hint = self._hint_at(unknown[0], args)
+            hint = self._hint_at(unknown[0], words)
             self.error(f'unrecognized arguments: {" ".join(unknown)}{hint}')
         return arguments, unknown
 
@@ -121,13 +122,12 @@ class _Parser(argparse.ArgumentParser):
         """Say what may be meant by one of the words, which is not taken."""
         if word in OF_ROS and self.get_default('accepts_ros_args'):
             return f'; did you mean {ROS_ARGS} {word}?'
-        options = self.options
         if word.startswith('-'):
-            return did_you_mean(word.partition('=')[0], options) if word[1:2] == '-' else ''
+            return did_you_mean(word.partition('=')[0], self.options) if word[1:2] == '-' else ''
         # Of a list with spaces only the first word belongs to its option.
         *_, option = ['', *(w for w in words[: words.index(word)] if w.startswith('-'))]
-        is_list = {name: re.search('LIST|,', f'{a.metavar}') for name, a in options.items()}
-        if option and any(is_list[name] for name in options if name.startswith(option)):
+        is_list = {name: re.search('LIST|,', f'{a.metavar}') for name, a in self.options.items()}
+        if option and any(is_list[name] for name in is_list if name.startswith(option)):
             first, second = words[words.index(option) + 1 :][:2]
             given = f'{option} {first.strip(",")},{second}'
             return f'; the list must be without spaces, as in {given}'

@@ -96,7 +96,7 @@ def _declare_scan(parser: argparse.ArgumentParser) -> None:
 def _declare_segment(parser: argparse.ArgumentParser) -> None:
     options.add(
         parser,
-        ('--segment', 'number of the segment, or of several side by side',
+        ('--segment', 'number of the segment, or of several side by side; or give --azimuth',
          {'metavar': 'N[,N]', 'type': _integers}),
         ('--azimuth', 'the segment in this direction, 90 = left',
          {'metavar': 'DEG', 'type': float}),
