@@ -101,8 +101,8 @@ class _Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Refuse what is no command, and, in the parser of the last one, what it does not take."""
         words = sys.argv[1:] if args is None else args
-        command = next((word for word in words if not word.startswith('-')), '')
-        if self.commands and command not in ('', *self.commands):
+        command = next((word for word in words if not word.startswith('-')), None)
+        if self.commands and command is not None and command not in self.commands:
             self._refuse_command(command)
         arguments, unknown = super().parse_known_args(words, namespace)
         if unknown and not self.commands:
@@ -113,7 +113,7 @@ class _Parser(argparse.ArgumentParser):
     def _refuse_command(self, word: str) -> NoReturn:
         """Say which command below this one a word may mean that is none."""
         file_command = FILE_COMMANDS.get(self.prog.split()[-1])
-        if file_command and (Path(word).suffix or Path(word).exists()):
+        if word and file_command and (Path(word).suffix or Path(word).exists()):
             self.error(f'{word}: no command; did you mean {self.prog} {file_command} {word}?')
         names = ', '.join(self.commands)
         self.error(f'{word!r}: must be one of {names}{did_you_mean(word, self.commands)}')
