@@ -11,9 +11,10 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import BrokenExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future
 from functools import partial
 from pathlib import Path
+from threading import Event, Thread, Timer
 
 import pytest
 from cli_runner import INTERRUPTED, children, error_line, is_running, run, start
@@ -226,6 +227,51 @@ def test_more_workers_than_a_machine_has_use_for(root, tmp_path, capsys):
     assert run('segment', root, '-o', tmp_path / 'out', '--workers', '99999999999') == 2
     assert 'must be 1 to' in error_line(capsys)
     assert not (tmp_path / 'out').exists()
+
+
+class InThread(Executor):
+    """A thread that does not keep Python from ending where it hangs."""
+
+    def submit(self, function, /, *args):
+        future = Future()
+        self.thread = Thread(target=lambda: future.set_result(function(*args)), daemon=True)
+        self.thread.start()
+        return future
+
+
+def test_ctrl_c_between_any_two_lines_of_the_wait_leaves_no_lock():
+    """Or the executor could not set the result, and would never end."""
+    last = 1
+    while last:
+        executor, gate, n_lines = InThread(), Event(), 0
+
+        def wait(block, progress, gate=gate):
+            gate.wait()
+
+        def interrupt(frame, event, _, executor=executor, last=last):
+            nonlocal n_lines
+            if 'concurrent/futures' in frame.f_code.co_filename and hasattr(executor, 'thread'):
+                n_lines += 1
+                if n_lines == last:
+                    sys.settrace(None)
+                    signal.raise_signal(signal.SIGINT)
+            return interrupt
+
+        runner = cluster.Runner(open_executor=partial(contextlib.nullcontext, executor))
+        opener = Timer(0.05, gate.set)
+        opener.start()
+        sys.settrace(interrupt)
+        try:
+            runner.run(wait, [1])
+            last = 0
+        except KeyboardInterrupt:
+            last += 1
+        finally:
+            sys.settrace(None)
+        opener.join()
+        executor.thread.join(10)
+        assert not executor.thread.is_alive(), f'at line {last}'
+    assert n_lines > 10
 
 
 @pytest.mark.parametrize('delay', [0.0, 0.1, 0.3])

@@ -22,11 +22,11 @@ from concurrent.futures import (
     Executor,
     Future,
     ProcessPoolExecutor,
-    as_completed,
 )
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from multiprocessing import resource_tracker
+from queue import SimpleQueue
 from typing import Any
 
 from tqdm import tqdm
@@ -154,10 +154,16 @@ def _completed(
     """
     compute = partial(_compute_block, _versions(), function)
     futures: dict[Future[tuple[Any, _Notes]], int] = {}
+    # Not `as_completed`: it locks all futures by turns, and where Ctrl-C comes between two of them
+    # they stay locked, so that the executor, which sets their results, never ends.
+    finished = SimpleQueue[Future[tuple[Any, _Notes]]]()
     with _ctrl_c_kept(), suppress(BrokenExecutor):  # processes start here, and may die here
         for k, block in blocks.items():
-            futures[executor.submit(compute, block)] = k
-    for future in as_completed(futures):
+            future = executor.submit(compute, block)
+            futures[future] = k
+            future.add_done_callback(finished.put)
+    while futures:
+        future = finished.get()
         k = futures.pop(future)  # or the cluster would keep the result
         try:
             yield k, future.result()
