@@ -5,8 +5,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
-from gp_ground_seg.data.bags import BagWriter
-from gp_ground_seg.data.point_cloud2 import encode_cloud
+from gp_ground_seg.data.bags import BagWriter, encode_cloud
 
 START = 1_317_000_000_123_456_789
 PERIOD = 100_000_000

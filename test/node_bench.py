@@ -19,8 +19,8 @@ import numpy as np
 from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.cli.demo import FRAME_ID, simulated_drive
 from gp_ground_seg.cli.options import progress
+from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_stamp
 from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, stamp_of, with_header
 from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
 from gp_ground_seg.lab.scoring.report import (
     Column,
@@ -119,7 +119,7 @@ class Probe:
 def restamped(clouds, start):
     """Yield clouds over and over, stamped every 0.1 s from the second `start` on."""
     for k, cloud in enumerate(itertools.cycle(clouds)):
-        yield with_header(cloud, (start + k // 10, k % 10 * 10**8))
+        yield with_stamp(cloud, (start + k // 10, k % 10 * 10**8))
 
 
 def measure(clouds, rates, n_frames, ros_args=()):

@@ -17,9 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag, is_bag_folder, resolve_storage
-from gp_ground_seg.data.bags import BagReader, BagWriter
+from gp_ground_seg.data.bags import BagReader, BagWriter, encode_cloud
 from gp_ground_seg.data.files import leftovers, staged_files
-from gp_ground_seg.data.point_cloud2 import encode_cloud
 
 SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive.db3', None)]
 
@@ -318,9 +317,8 @@ def test_without_rosbags_the_error_says_what_to_install(tmp_path):
         import sys
         sys.modules['rosbags'] = None
         from gp_ground_seg.data import bags
-        from gp_ground_seg.data.point_cloud2 import decode_cloud
         from gp_ground_seg.core.errors import MissingDependencyError
-        for call in (bags.BagReader, bags.BagWriter, decode_cloud):
+        for call in (bags.BagReader, bags.BagWriter, bags.decode_cloud):
             try:
                 call('drive.mcap')
             except MissingDependencyError as error:

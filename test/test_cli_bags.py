@@ -23,8 +23,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.data.bags import BagReader
-from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
+from gp_ground_seg.data.bags import BagReader, decode_cloud, stamp_of
 from gp_ground_seg.ros import playback, start_stop
 
 RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)

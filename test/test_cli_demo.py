@@ -18,8 +18,7 @@ from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.cli.demo import Tally
 from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.data import point_cloud2
-from gp_ground_seg.data.bags import BagReader
+from gp_ground_seg.data.bags import BagReader, decode_cloud
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
 from gp_ground_seg.ros import start_stop
 from gp_ground_seg.ros.node_process import NodeProcess, private_session
@@ -89,9 +88,7 @@ def test_demo_without_data(rclpy, tmp_path):
     # Fast DDS only warns about a profile that it cannot read, and goes on without.
     assert 'XML' not in (folder / 'node.log').read_text()
     with BagReader(folder / 'drive.mcap') as bag:
-        n_points = sum(
-            point_cloud2.decode_cloud(raw).width for _, _, raw in bag.messages([demo.TOPIC])
-        )
+        n_points = sum(decode_cloud(raw).width for _, _, raw in bag.messages([demo.TOPIC]))
     count = f'{n_points:,}'.replace(',', ' ')
     assert f'{count} in 4 scans sent, {count} back' in first.stdout
     assert again.returncode == 2 and len(again.stderr.splitlines()) == 1

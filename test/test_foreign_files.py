@@ -8,11 +8,10 @@ import pytest
 from foreign_files import CASES, XYZ
 
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.data.bags import BagReader, BagWriter
+from gp_ground_seg.data.bags import BagReader, BagWriter, encode_cloud
 from gp_ground_seg.data.cloud_files import decode_file
 from gp_ground_seg.data.clouds import note
 from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.data.point_cloud2 import encode_cloud
 
 pytest.importorskip('lzf', reason='needs the extra formats')
 

@@ -18,12 +18,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.data.bags import BagWriter
+from gp_ground_seg.data.bags import BagWriter, encode_cloud
 from gp_ground_seg.data.cloud_files import WRITABLE, decode_file, encode_file, read_file
 from gp_ground_seg.data.clouds import cloud_of, gather, name_columns
 from gp_ground_seg.data.pcd import PcdHeader
 from gp_ground_seg.data.ply import PlyHeader
-from gp_ground_seg.data.point_cloud2 import encode_cloud
 
 lzf = pytest.importorskip('lzf', reason='needs the extra formats')
 

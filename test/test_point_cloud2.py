@@ -15,7 +15,14 @@ from hypothesis import strategies as st
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
-from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_columns, read_xyz
+from gp_ground_seg.data.bags import (
+    cloud_from_columns,
+    decode_cloud,
+    encode_cloud,
+    stamp_of,
+    with_stamp,
+)
+from gp_ground_seg.data.point_cloud2 import read_columns, read_xyz
 
 FLOAT32, FLOAT64 = 7, 8
 STRUCT_CODES = dict(enumerate('bBhHiIfd', 1))
@@ -167,7 +174,7 @@ def test_what_is_not_needed_is_not_checked():
     empty = Layout(0, 0, [], False, 0, 0, b'')
     assert read_xyz(empty).shape == (0, 3)
     assert len(point_cloud2.select_rows(empty, np.zeros(0, dtype=bool))) == 0
-    cloud = point_cloud2.cloud_from_columns((0, 0), 'lidar', {})
+    cloud = cloud_from_columns((0, 0), 'lidar', {})
     assert point_cloud2.select_points(cloud, np.zeros(0, dtype=bool)).width == 0
     layout = kitti_layout(row_step=0)
     np.testing.assert_array_equal(read_xyz(layout), read_xyz(kitti_layout()))
@@ -238,7 +245,7 @@ def assert_same_cloud(cloud, expected):
         np.testing.assert_equal(getattr(cloud, field.name), getattr(expected, field.name))
 
 
-def test_selection_and_another_header_keep_all_else():
+def test_selection_and_another_stamp_keep_all_else():
     cloud = samples.cloud(2)
     mask = np.isfinite(read_xyz(cloud)).all(axis=1)
     kept = decode_cloud(encode_cloud(point_cloud2.select_points(cloud, mask)))
@@ -246,24 +253,23 @@ def test_selection_and_another_header_keep_all_else():
     shape = {'width': mask.sum(), 'row_step': len(data)}
     assert_same_cloud(kept, dataclasses.replace(cloud, **shape, data=data, is_dense=True))
     assert not point_cloud2.select_points(cloud, ~mask).is_dense
-    for frame, expected in ((None, 'velo_link'), ('map', 'map')):
-        moved = decode_cloud(encode_cloud(point_cloud2.with_header(cloud, (7, 8), frame)))
-        assert (point_cloud2.stamp_of(moved), moved.header.frame_id) == ((7, 8), expected)
-        assert_same_cloud(dataclasses.replace(moved, header=cloud.header), cloud)
+    moved = decode_cloud(encode_cloud(with_stamp(cloud, (7, 8))))
+    assert (stamp_of(moved), moved.header.frame_id) == ((7, 8), 'velo_link')
+    assert_same_cloud(dataclasses.replace(moved, header=cloud.header), cloud)
 
 
 def test_cloud_from_columns_is_packed_and_typed():
     points = samples.scan(1)
     label = np.arange(len(points), dtype=np.uint32)
     columns = {'x': points[:, 0], 'y': points[:, 1], 'z': points[:, 2], 'label': label}
-    cloud = decode_cloud(encode_cloud(point_cloud2.cloud_from_columns((5, 6), 'lidar', columns)))
+    cloud = decode_cloud(encode_cloud(cloud_from_columns((5, 6), 'lidar', columns)))
     assert [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields] == [
         ('x', 0, 7, 1), ('y', 4, 7, 1), ('z', 8, 7, 1), ('label', 12, 6, 1),
     ]  # fmt: skip
-    assert (point_cloud2.stamp_of(cloud), cloud.header.frame_id) == ((5, 6), 'lidar')
+    assert (stamp_of(cloud), cloud.header.frame_id) == ((5, 6), 'lidar')
     np.testing.assert_array_equal(read_xyz(cloud), points[:, :3])
     np.testing.assert_array_equal(read_columns(cloud, ['label'])['label'][0], label)
-    assert point_cloud2.cloud_from_columns((0, 0), '', {}).width == 0
+    assert cloud_from_columns((0, 0), '', {}).width == 0
 
 
 @settings(max_examples=60)

@@ -15,15 +15,10 @@ from foreign_files import CASES
 
 from gp_ground_seg.core.errors import DataError, GroundSegError, PointCloudError
 from gp_ground_seg.data import cloud_files
+from gp_ground_seg.data.bags import decode_cloud, encode_cloud
 from gp_ground_seg.data.cloud_files import decode_file, encode_file
 from gp_ground_seg.data.clouds import Cloud, scatter
-from gp_ground_seg.data.point_cloud2 import (
-    decode_cloud,
-    encode_cloud,
-    read_fields,
-    read_xyz,
-    select_points,
-)
+from gp_ground_seg.data.point_cloud2 import read_fields, read_xyz, select_points
 
 N_INPUTS = 6000
 SECONDS = 10

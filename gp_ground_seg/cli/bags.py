@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
-from gp_ground_seg.data.bags import BagReader, BagWriter
-from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns, encode_cloud
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_from_columns, encode_cloud
+from gp_ground_seg.data.point_cloud2 import CloudMessage
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
 from gp_ground_seg.ros.start_stop import large_cloud_transport, needing_ros, ros_session
 

@@ -16,15 +16,9 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.log import in_thousands
-from gp_ground_seg.data.bags import BagReader, BagWriter
+from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud
 from gp_ground_seg.data.files import staged_files
-from gp_ground_seg.data.point_cloud2 import (
-    CloudMessage,
-    decode_cloud,
-    encode_cloud,
-    read_fields,
-    read_xyz,
-)
+from gp_ground_seg.data.point_cloud2 import CloudMessage, read_fields, read_xyz
 from gp_ground_seg.lab.plotting import new_figure, plot_scan_view
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_labels, label_ratios
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive

@@ -42,9 +42,9 @@ def shown(text: object) -> str:
     return ''.join(c if c.isprintable() else repr(c)[1:-1] for c in str(text))
 
 
-def reason_of(error: OSError) -> str:
+def reason_of(error: Exception) -> str:
     """Why the operating system refused, without number and name of the file."""
-    return error.strerror or in_one_line(error)
+    return getattr(error, 'strerror', None) or in_one_line(error)
 
 
 def install_hint(packages: str) -> str:

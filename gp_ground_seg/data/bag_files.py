@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sqlite3
 import struct
 from collections import Counter
 from collections.abc import Iterator
@@ -176,13 +175,3 @@ def reading(path: Path) -> Iterator[None]:
         said = in_one_line(error)
         step = next((f' ({hint})' for key, hint in _NEXT_STEP.items() if key in said), '')
         raise DataError(f'{path}: cannot be read as a bag: {said}{step}') from error
-
-
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Raise errors of writing a bag, as on a full disk, as `DataError` with its path."""
-    try:
-        yield
-    except (OSError, sqlite3.Error) as error:
-        reason = getattr(error, 'strerror', None) or error
-        raise DataError(f'{path}: cannot be written: {reason}') from error

@@ -1,5 +1,7 @@
 """Bags: ROS 1, rosbag2 folders, MCAP and sqlite3 files read; rosbag2 written whole or not at all.
 
+And the clouds in them: messages of rosbags, and their CDR bytes.
+
 The one module that imports rosbags, mcap and zstandard, optional packages; only where a bag is
 used. Why not rosbags for MCAP and rosbag2 folders: a channel of protobuf or JSON, no profile, or
 one line of metadata.yaml that is not needed stop it (test/foreign_files.py).
@@ -12,12 +14,16 @@ import os
 import sqlite3
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing
+from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gp_ground_seg.core.errors import DataError, require
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.core.errors import DataError, PointCloudError, in_one_line, require
 from gp_ground_seg.data.bag_files import (
     METADATA_FILE,
     PACKED_SUFFIXES,
@@ -31,9 +37,10 @@ from gp_ground_seg.data.bag_files import (
     reading,
     resolve_storage,
     storage_of,
-    writing,
 )
-from gp_ground_seg.data.files import staged_bag_folder, staged_file
+from gp_ground_seg.data.clouds import check_numbers, gather
+from gp_ground_seg.data.files import staged_bag_folder, staged_file, writing
+from gp_ground_seg.data.point_cloud2 import DATATYPES, CloudMessage
 
 
 @functools.cache
@@ -351,3 +358,65 @@ class BagWriter:
         """Append one message, CDR bytes, to a declared topic with its recorded `time` [ns]."""
         with writing(self.path):
             self._writer.write(self._connections[topic], time, raw)
+
+
+def stamp_of(cloud: CloudMessage) -> tuple[int, int]:
+    """Seconds and nanoseconds of the header."""
+    return cloud.header.stamp.sec, cloud.header.stamp.nanosec
+
+
+def with_stamp(cloud: CloudMessage, stamp: tuple[int, int]) -> CloudMessage:
+    """Copy of a message with another stamp, in s and ns; the points are shared."""
+    moved = copy(cloud)
+    moved.header = _new_header(stamp, cloud.header.frame_id)
+    return moved
+
+
+def cloud_from_columns(
+    stamp: tuple[int, int], frame_id: str, columns: Mapping[str, npt.NDArray[Any]]
+) -> CloudMessage:
+    """Message with one float32 or uint32 field per column (N,), packed; `stamp` in s and ns."""
+    types = jazzy_types().types
+    codes = {name: f'{values.dtype.kind}4' for name, values in columns.items()}
+    points = gather({name: values.astype(f'<{codes[name]}') for name, values in columns.items()})
+    step, n_points = points.dtype.itemsize, len(points)
+    cloud: CloudMessage = types[POINT_CLOUD2](
+        header=_new_header(stamp, frame_id),
+        height=1,
+        width=n_points,
+        fields=[
+            types['sensor_msgs/msg/PointField'](name, 4 * k, DATATYPES[code], 1)
+            for k, (name, code) in enumerate(codes.items())
+        ],
+        is_bigendian=False,
+        point_step=step,
+        row_step=step * n_points,
+        data=np.frombuffer(points.tobytes(), np.uint8),
+        is_dense=False,
+    )
+    return cloud
+
+
+def _new_header(stamp: tuple[int, int], frame_id: str) -> Any:
+    types = jazzy_types().types
+    return types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](*stamp), frame_id)
+
+
+def decode_cloud(raw: bytes | memoryview) -> CloudMessage:
+    """Message of rosbags from its CDR bytes.
+
+    Raises PointCloudError if they are none, or have more numbers per point than accepted.
+    """
+    types = jazzy_types()
+    try:
+        cloud: CloudMessage = types.deserialize_cdr(raw, POINT_CLOUD2)
+    except Exception as error:  # Its kind depends on where parsing went astray.
+        said = f'{len(raw)} bytes that are no {POINT_CLOUD2}: {in_one_line(error)}'
+        raise PointCloudError(said) from error
+    check_numbers(sum(max(field.count, 1) for field in cloud.fields))
+    return cloud
+
+
+def encode_cloud(cloud: CloudMessage) -> bytes:
+    """CDR bytes of a message of rosbags; raises MissingDependencyError as `decode_cloud`."""
+    return bytes(jazzy_types().serialize_cdr(cloud, POINT_CLOUD2))

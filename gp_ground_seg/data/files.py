@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import glob
 import os
+import sqlite3
 import stat
 import tempfile
 import uuid
@@ -65,10 +66,10 @@ def checksum(path: Path) -> str:
 
 @contextmanager
 def writing(path: str | Path) -> Iterator[None]:
-    """Raise an OSError of the block as a DataError that blames this file."""
+    """Raise an error of writing in the block as a DataError that blames this file or bag."""
     try:
         yield
-    except OSError as error:
+    except (OSError, sqlite3.Error) as error:
         raise DataError(f'{path}: cannot be written: {reason_of(error)}') from error
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from gp_ground_seg.core.errors import DataError, PointCloudError, shown
 from gp_ground_seg.core.pipeline.points import take_points
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
-from gp_ground_seg.data.bags import BagReader
+from gp_ground_seg.data.bags import BagReader, decode_cloud
 from gp_ground_seg.data.cloud_files import (
     FROM_TEXT,
     KITTI_COLUMNS,
@@ -24,7 +24,7 @@ from gp_ground_seg.data.cloud_files import (
     read_file,
 )
 from gp_ground_seg.data.clouds import Cloud
-from gp_ground_seg.data.point_cloud2 import decode_cloud, read_fields, read_xyz
+from gp_ground_seg.data.point_cloud2 import read_fields, read_xyz
 
 # Where the scans are in a sequence of SemanticKITTI or a root of nuScenes, and those sequences.
 _SCAN_FOLDERS = ('.', 'velodyne', 'samples/LIDAR_TOP')

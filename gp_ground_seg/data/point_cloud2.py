@@ -1,4 +1,4 @@
-"""``sensor_msgs/PointCloud2`` in numpy: coordinates, columns, selections, and CDR bytes.
+"""``sensor_msgs/PointCloud2`` in numpy: coordinates, columns, selections.
 
 The layout functions take any object with the attributes of the message, rclpy's or rosbags'.
 Why not `sensor_msgs_py`: it needs ROS, and refuses legal clouds.
@@ -20,13 +20,11 @@ from numpy.lib.stride_tricks import as_strided
 
 from gp_ground_seg.core.errors import PointCloudError, in_one_line
 from gp_ground_seg.core.pipeline.points import finite_points, single_precision
-from gp_ground_seg.data.bag_files import POINT_CLOUD2
-from gp_ground_seg.data.bags import jazzy_types
-from gp_ground_seg.data.clouds import check_numbers, distinct, gather
+from gp_ground_seg.data.clouds import distinct
 
 _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 _DATATYPE_NAMES = {datatype: np.dtype(code).name.upper() for datatype, code in _CODES.items()}
-_DATATYPES = {code: datatype for datatype, code in _CODES.items()}
+DATATYPES = {code: datatype for datatype, code in _CODES.items()}
 _FLOATS = (7, 8)
 _ALIGNMENT = 4  # added columns start at a multiple of this in a point, or of their size [bytes]
 
@@ -159,7 +157,7 @@ def append_columns(
     for name, values in columns.items():
         itemsize = values.dtype.itemsize
         start = _round_up(end, itemsize)
-        placed.append((name, start, _DATATYPES[f'{values.dtype.kind}{itemsize}']))
+        placed.append((name, start, DATATYPES[f'{values.dtype.kind}{itemsize}']))
         end = start + itemsize
     step = _round_up(end, _ALIGNMENT)
     height, width = cloud.height, cloud.width
@@ -283,65 +281,3 @@ def message_data(values: npt.NDArray[Any], typecode: str = 'B') -> array[Any]:
     data = array(typecode)
     data.frombytes(np.ascontiguousarray(values).data.cast('B') if values.size else b'')
     return data
-
-
-def stamp_of(cloud: CloudMessage) -> tuple[int, int]:
-    """Seconds and nanoseconds of the header."""
-    return cloud.header.stamp.sec, cloud.header.stamp.nanosec
-
-
-def with_header(cloud: Cloud, stamp: tuple[int, int], frame_id: str | None = None) -> Cloud:
-    """Copy of a message of rosbags with another stamp, or frame too; the points are shared."""
-    moved = copy(cloud)
-    moved.header = _new_header(stamp, cloud.header.frame_id if frame_id is None else frame_id)
-    return moved
-
-
-def cloud_from_columns(
-    stamp: tuple[int, int], frame_id: str, columns: Mapping[str, npt.NDArray[Any]]
-) -> CloudMessage:
-    """Message with one float32 or uint32 field per column (N,), packed; `stamp` in s and ns."""
-    types = jazzy_types().types
-    codes = {name: f'{values.dtype.kind}4' for name, values in columns.items()}
-    points = gather({name: values.astype(f'<{codes[name]}') for name, values in columns.items()})
-    step, n_points = points.dtype.itemsize, len(points)
-    cloud: CloudMessage = types[POINT_CLOUD2](
-        header=_new_header(stamp, frame_id),
-        height=1,
-        width=n_points,
-        fields=[
-            types['sensor_msgs/msg/PointField'](name, 4 * k, _DATATYPES[code], 1)
-            for k, (name, code) in enumerate(codes.items())
-        ],
-        is_bigendian=False,
-        point_step=step,
-        row_step=step * n_points,
-        data=np.frombuffer(points.tobytes(), np.uint8),
-        is_dense=False,
-    )
-    return cloud
-
-
-def _new_header(stamp: tuple[int, int], frame_id: str) -> Any:
-    types = jazzy_types().types
-    return types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](*stamp), frame_id)
-
-
-def decode_cloud(raw: bytes | memoryview) -> CloudMessage:
-    """Message of rosbags from its CDR bytes.
-
-    Raises PointCloudError if they are none, or have more numbers per point than accepted.
-    """
-    types = jazzy_types()
-    try:
-        cloud: CloudMessage = types.deserialize_cdr(raw, POINT_CLOUD2)
-    except Exception as error:  # Its kind depends on where parsing went astray.
-        said = f'{len(raw)} bytes that are no {POINT_CLOUD2}: {in_one_line(error)}'
-        raise PointCloudError(said) from error
-    check_numbers(sum(max(field.count, 1) for field in cloud.fields))
-    return cloud
-
-
-def encode_cloud(cloud: CloudMessage) -> bytes:
-    """CDR bytes of a message of rosbags; raises MissingDependencyError as `decode_cloud`."""
-    return bytes(jazzy_types().serialize_cdr(cloud, POINT_CLOUD2))

@@ -14,13 +14,8 @@ from functools import partial
 from pathlib import Path
 
 from gp_ground_seg.core.errors import GroundSegError
-from gp_ground_seg.data.point_cloud2 import (
-    CloudMessage,
-    decode_cloud,
-    encode_cloud,
-    stamp_of,
-    with_header,
-)
+from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_stamp
+from gp_ground_seg.data.point_cloud2 import CloudMessage
 from gp_ground_seg.ros.start_stop import (
     Session,
     child_command,
@@ -115,7 +110,7 @@ class Link:
 
     def connect(self, cloud: CloudMessage) -> None:
         """Send a cloud until the node answers, and has the backend that it keeps."""
-        first = with_header(cloud, (1, 0))
+        first = with_stamp(cloud, (1, 0))
         end = time.monotonic() + START_TIMEOUT
         while self._ask(first, 0.2) is None or not self._node.is_settled():
             if time.monotonic() > end:

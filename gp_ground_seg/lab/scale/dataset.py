@@ -17,7 +17,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES
-from gp_ground_seg.data.bags import BagReader, BagWriter
+from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud
 from gp_ground_seg.data.cloud_files import encode_output
 from gp_ground_seg.data.files import (
     PARTIAL_MARK,
@@ -29,7 +29,7 @@ from gp_ground_seg.data.files import (
     writing,
 )
 from gp_ground_seg.data.inputs import Input
-from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
+from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
 from gp_ground_seg.lab.scale.cluster import Progress
 
 _LOGGER = logging.getLogger('gp_ground_seg')
