@@ -11,7 +11,7 @@ from PIL import Image
 
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.cli.demo import simulated_drive
-from gp_ground_seg.core.log import in_thousands
+from gp_ground_seg.core.errors import in_thousands
 from gp_ground_seg.lab.plotting import plot_scan_view
 
 N_SCANS, PERIOD = 30, 100

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import PRESETS, parameter_specs
-from gp_ground_seg.core.parameters.export import accepted_values, to_yaml, yaml_scalar
+from gp_ground_seg.core.parameters.schema import yaml_scalar
 
 ROOT = Path(__file__).resolve().parent.parent
 README = 'README.md'
@@ -46,7 +46,7 @@ def to_markdown_table() -> str:
     for spec in parameter_specs():
         if spec.basic:
             name, default = f'`{spec.name}`', f'`{yaml_scalar(spec.default)}`'
-            accepted = f'{accepted_values(spec)} {spec.unit}'.rstrip()
+            accepted = f'{spec.accepted_briefly} {spec.unit}'.rstrip()
             symbol = f' (`{spec.symbol}`)' if spec.symbol else ''
             rows.append((name, default, accepted, f'{spec.description}{symbol}'))
     lines = ['| ' + ' | '.join(cell.replace('|', r'\|') for cell in row) + ' |' for row in rows]
@@ -114,7 +114,7 @@ def generated_files(readme: str) -> dict[str, str]:
     DataError as `with_table`.
     """
     files = {
-        f'config/{preset.name}.yaml': to_yaml(preset.config, preset.title, preset.reasons)
+        f'config/{preset.name}.yaml': preset.config.to_yaml(preset.title, preset.reasons)
         for preset in PRESETS.values()
     }
     files[README] = with_table(readme, SCORES, to_scores_table())

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.core.errors import in_thousands
 from gp_ground_seg.core.frame import BoolArray, PointArray
-from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.lab.plotting import COLOURS, new_figure, save
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan

@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.lab.scoring.evaluate import MethodResult
-from gp_ground_seg.lab.scoring.frames import Scores, make_scores
+from gp_ground_seg.lab.scoring.evaluate import MethodResult, Scores, make_scores
 
 
 def scores_of(**methods: list[dict]) -> Scores:

@@ -89,7 +89,7 @@ def edits(source):
         if isinstance(node, ast.stmt):
             first = node.lineno
         if isinstance(node, ast.expr | ast.stmt):
-            if isinstance(node, ast.Raise) or '_LOGGER' in code(node)[:8]:
+            if isinstance(node, ast.Raise) or 'LOGGER' in code(node)[:8]:
                 return  # words
             for fault in of_node(node):
                 yield type(node).__name__, first, *fault

@@ -17,12 +17,12 @@ from evaluation_samples import label_files
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.cli.segment import _pose_summary
-from gp_ground_seg.core.log import in_thousands
+from gp_ground_seg.core.errors import in_thousands
 from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud
 from gp_ground_seg.data.clouds import gather, name_columns
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
-from gp_ground_seg.lab.scale.dataset import Outcome
+from gp_ground_seg.lab.dataset import Outcome
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 
 SUMMARY = re.compile(

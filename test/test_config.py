@@ -19,7 +19,6 @@ from gp_ground_seg import Config, ConfigError, GroundSegError
 from gp_ground_seg.cli.options import parse_setting
 from gp_ground_seg.core.parameters import number_tuples
 from gp_ground_seg.core.parameters.config import find_spec, parameter_specs
-from gp_ground_seg.core.parameters.export import file_problems
 from gp_ground_seg.core.parameters.removed import REMOVED
 
 SPECS = parameter_specs()
@@ -193,7 +192,7 @@ def test_what_is_removed_comes_with_what_to_use_instead(key, tmp_path, capsys):
     for read in (lambda: Config().replace(**{name: value or 1}), lambda: Config.from_yaml(path)):
         with pytest.raises(ConfigError, match=re.escape(line) + '$'):
             read()
-    assert file_problems(path) == [line]
+    assert Config.problems_of_file(path) == [line]
     for words in (['--set', f'{name}={value or 1}'], ['--config', path]):
         assert run('config', 'dump', *words) == 2
         assert error_line(capsys).endswith(line)

@@ -11,9 +11,7 @@ from hypothesis import given, settings
 
 from gp_ground_seg import Config, ConfigError
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.core.parameters import export
 from gp_ground_seg.core.parameters.config import PRESETS, find_preset, parameter_specs
-from gp_ground_seg.core.parameters.export import file_problems
 from gp_ground_seg.core.parameters.removed import REMOVED
 
 GENERATE = 'run: make generate'
@@ -25,9 +23,9 @@ generate = load_script('docs/generate.py')
 def test_yaml_reads_back_in_the_types_that_ros_wants(tmp_path_factory, config):
     """ROS parameters are typed: 2 is not a double, and 1e-05 without a point is no number."""
     path = tmp_path_factory.mktemp('yaml') / 'a.yaml'
-    path.write_text(export.to_yaml(config), encoding='utf-8')
+    path.write_text(config.to_yaml(), encoding='utf-8')
     assert Config.from_yaml(path) == config
-    assert file_problems(path) == []
+    assert Config.problems_of_file(path) == []
     document = yaml.safe_load(path.read_text())
     nested = yaml.safe_load(yaml.safe_dump(config.nested()))  # a box is a list there
     assert document == {'/**': {'ros__parameters': nested}}
@@ -41,7 +39,7 @@ def test_yaml_reads_back_in_the_types_that_ros_wants(tmp_path_factory, config):
 
 
 def test_every_parameter_is_explained_above_it():
-    lines = export.to_yaml(Config()).splitlines()
+    lines = Config().to_yaml().splitlines()
     assert max(len(line) for line in lines) <= 99
     assert all(line == line.rstrip() for line in lines)
     specs = iter(parameter_specs())
@@ -185,9 +183,9 @@ def test_check_says_everything_at_once(tmp_path, capsys):
         ('a: 1\na: 2', 'given twice'),
     ):
         good.write_text(text)
-        (found,) = file_problems(good)
+        (found,) = Config.problems_of_file(good)
         assert problem in found
-    (found,) = file_problems(tmp_path / 'missing.yaml')
+    (found,) = Config.problems_of_file(tmp_path / 'missing.yaml')
     assert 'No such file' in found
 
 

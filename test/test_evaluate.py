@@ -22,8 +22,7 @@ from gp_ground_seg.lab.experiments.variants import SimulatedFrame, load_simulate
 from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.scoring import metrics, tables
 from gp_ground_seg.lab.scoring.comparison import iou_measure
-from gp_ground_seg.lab.scoring.evaluate import OurMethod
-from gp_ground_seg.lab.scoring.frames import KEYS, each, make_scores, sums, with_all
+from gp_ground_seg.lab.scoring.evaluate import KEYS, OurMethod, each, make_scores, sums, with_all
 from gp_ground_seg.lab.scoring.metrics import COUNTS, label_ratios
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
 

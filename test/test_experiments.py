@@ -15,8 +15,7 @@ from gp_ground_seg.lab.experiments import ablation, scenes, variants
 from gp_ground_seg.lab.experiments.ablation import MODELS
 from gp_ground_seg.lab.experiments.variants import TOLD
 from gp_ground_seg.lab.scoring import evaluate as runner
-from gp_ground_seg.lab.scoring.evaluate import OURS
-from gp_ground_seg.lab.scoring.frames import make_scores
+from gp_ground_seg.lab.scoring.evaluate import OURS, make_scores
 from gp_ground_seg.lab.scoring.metrics import count_labels, height_sums, label_ratios
 from gp_ground_seg.lab.scoring.objects import CLASSES, count_objects
 from gp_ground_seg.lab.scoring.peers import InterpolationMethod, ground_points

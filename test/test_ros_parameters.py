@@ -16,7 +16,6 @@ from ros_helpers import bench, street, to_message
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.config import PRESETS, find_spec, parameter_specs
-from gp_ground_seg.core.parameters.export import file_problems
 from gp_ground_seg.core.parameters.removed import REMOVED
 from gp_ground_seg.ros.node import CHANGED
 
@@ -230,7 +229,7 @@ def test_what_is_dumped_is_what_runs_and_can_be_given_at_start(b, tmp_path, heig
     path = tmp_path / 'dumped.yaml'
     path.write_text(yaml.safe_dump(dump(b)))
     # Our own tools read it, use_sim_time, qos_overrides and all.
-    assert file_problems(path) == []
+    assert Config.problems_of_file(path) == []
     assert Config.from_yaml(path) == config
     namespace, _, name = b.node_name.rpartition('/')
     words = '-r', f'__ns:={namespace}', '-r', f'__node:={name}', '--params-file', str(path)

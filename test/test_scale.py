@@ -23,7 +23,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.lab.scale import cluster
+from gp_ground_seg.lab import cluster
 
 dask, distributed = pytest.importorskip('dask'), pytest.importorskip('distributed')
 # Dask leaves sockets and event loops to the garbage collector when its processes end.
@@ -210,7 +210,7 @@ def _sockets_that_listen(block, progress):
 def test_nothing_listens_with_workers(scheduler):
     assert sockets(os.getpid()) & listening()  # as that scheduler does
     code = (
-        'from gp_ground_seg.lab.scale import cluster; import test_scale; '
+        'from gp_ground_seg.lab import cluster; import test_scale; '
         'context = cluster.open_runner(2, None, cluster._NO_BAR); runner = context.__enter__(); '
         'print(runner.run(test_scale._sockets_that_listen, range(8)))'
     )

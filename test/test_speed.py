@@ -11,8 +11,7 @@ from evaluation_samples import write_streets
 from gp_ground_seg import Config
 from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab.experiments import speed
-from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP
-from gp_ground_seg.lab.scoring.frames import make_scores
+from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, make_scores
 
 SMALL = {'grid.n_segments': 8, 'learning.max_evaluations': 1}
 NUMPY = Config().replace(**{'runtime.backend': 'numpy', **SMALL})

@@ -32,7 +32,6 @@ from torture_fuzz import WORDS, fuzz, mutant, samples_of_readers
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.core.parameters.config import parameter_specs
-from gp_ground_seg.core.parameters.export import to_yaml
 from gp_ground_seg.core.pipeline.points import take_points
 
 TEST = Path(__file__).parent
@@ -225,7 +224,7 @@ def make_samples(folder):
     points.tofile(folder / 'scan.bin')
     write_frame(folder / 'root', '00', 0, points, np.full(len(points), 40, '<u4'))
     robot, sequence = folder / 'robot.yaml', folder / 'root/sequences/00'
-    robot.write_text(to_yaml(Config()))
+    robot.write_text(Config().to_yaml())
     for name in ('drive.mcap', 'drive.db3', 'drive'):
         write_ros2_bag(folder / name)
     write_ros1_bag(folder / 'drive.bag')

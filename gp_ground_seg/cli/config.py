@@ -7,7 +7,6 @@ import sys
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import shown
-from gp_ground_seg.core.parameters import export
 from gp_ground_seg.core.parameters.config import Config, find_preset, parameter_specs
 from gp_ground_seg.core.parameters.schema import NO_VALUES, read_parameters
 
@@ -52,7 +51,7 @@ def run_dump(arguments: argparse.Namespace) -> int:
     title = preset.title if config == preset.config else ''
     kept = [name for name in preset.reasons if config[name] == preset.config[name]]
     reasons = {name: preset.reasons[name] for name in kept}
-    print(export.to_yaml(config, title, reasons), end='')
+    print(config.to_yaml(title, reasons), end='')
     return 0
 
 
@@ -60,7 +59,7 @@ def run_check(arguments: argparse.Namespace) -> int:
     """Print the problems of each file, or how much it gives and changes."""
     code = 0
     for path in arguments.files:
-        if problems := export.file_problems(path):
+        if problems := Config.problems_of_file(path):
             code = 2
             lines = (shown(f'{path}: {problem}') for problem in problems)
             print(*lines, sep='\n', file=sys.stderr)
@@ -68,7 +67,7 @@ def run_check(arguments: argparse.Namespace) -> int:
         file = read_parameters(path)
         if not file.values:
             options.note(f'{path}: {NO_VALUES}')
-        n_changed = len(export.differences(Config(), Config().replace(**file.values)))
+        n_changed = len(Config().differences(Config().replace(**file.values)))
         given = f'{len(file.values)} of {len(parameter_specs())} parameters given'
         use = ''
         if not file.node:

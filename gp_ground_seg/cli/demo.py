@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.bags import scan_cloud
+from gp_ground_seg.core.errors import in_thousands
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud
 from gp_ground_seg.data.files import staged_files
 from gp_ground_seg.data.point_cloud2 import CloudMessage, read_fields, read_xyz

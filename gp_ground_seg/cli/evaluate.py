@@ -22,11 +22,12 @@ from gp_ground_seg.lab.scoring.evaluate import (
     KnownScan,
     Method,
     OurMethod,
+    Scores,
     load_kitti,
     score_methods,
+    sums,
     title_of,
 )
-from gp_ground_seg.lab.scoring.frames import Scores, sums
 from gp_ground_seg.lab.scoring.metrics import label_ratios
 from gp_ground_seg.lab.scoring.objects import CUT_HEIGHT
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod

@@ -14,16 +14,25 @@ from typing import Any
 
 from tqdm import tqdm
 
-from gp_ground_seg.core import log
-from gp_ground_seg.core.errors import ConfigError, DataError, shown
+from gp_ground_seg.core.errors import (
+    ConfigError,
+    DataError,
+    in_thousands,
+    messages_passed_to,
+    shown,
+)
 from gp_ground_seg.core.jit import has_to_compile
 from gp_ground_seg.core.parameters.config import PRESETS, Config, find_preset
-from gp_ground_seg.core.parameters.export import differences, yaml_scalar
-from gp_ground_seg.core.parameters.schema import YAML_SUFFIXES, did_you_mean, load_yaml
+from gp_ground_seg.core.parameters.schema import (
+    YAML_SUFFIXES,
+    did_you_mean,
+    load_yaml,
+    yaml_scalar,
+)
 from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, MIN_COLUMNS
 from gp_ground_seg.data.files import leftovers, staged_file
 from gp_ground_seg.data.inputs import Inputs, list_inputs
-from gp_ground_seg.lab.scale.cluster import Runner, open_runner
+from gp_ground_seg.lab.cluster import Runner, open_runner
 
 DEFAULT_PRESET = 'default'
 COMPILING_PAYS = 300  # scans
@@ -214,7 +223,7 @@ def changed_lines(first: Config, second: Config) -> list[str]:
     """Return a line for each parameter that differs, as in ``grid.n_bins: 80 -> 120``."""
     return [
         f'{spec.name}: {yaml_scalar(before)} -> {yaml_scalar(after)} {spec.unit}'.rstrip()
-        for spec, before, after in differences(first, second)
+        for spec, before, after in first.differences(second)
     ]
 
 
@@ -237,7 +246,7 @@ def note(message: str) -> None:
 
 def library_notes(level: int = logging.INFO) -> AbstractContextManager[None]:
     """Print what the library logs, such as that it compiles, as notes within the block."""
-    return log.passed_to(lambda _, text: note(text), level)
+    return messages_passed_to(lambda _, text: note(text), level)
 
 
 @contextmanager
@@ -259,7 +268,7 @@ def note_leftovers(target: Path, *, quiet: bool = False) -> None:
 
 def count(number: int, noun: str) -> str:
     """Return number and noun, as in ``1 frame``, ``2 000 frames``."""
-    return f'{log.in_thousands(number)} {noun}{"" if number == 1 else "s"}'
+    return f'{in_thousands(number)} {noun}{"" if number == 1 else "s"}'
 
 
 def progress(title: str, *, quiet: bool = False, unit: str = 'frame') -> partial[tqdm[Any]]:

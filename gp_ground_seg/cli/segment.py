@@ -13,15 +13,14 @@ from gp_ground_seg import __version__
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.parameters.export import to_yaml
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.cloud_files import FORMATS, LABELS, format_for, read_file
 from gp_ground_seg.data.files import check_writable, flush, writing
 from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences
-from gp_ground_seg.lab.scale.cluster import cut
-from gp_ground_seg.lab.scale.dataset import (
+from gp_ground_seg.lab.cluster import cut
+from gp_ground_seg.lab.dataset import (
     PARAMETERS,
     Item,
     Outcome,
@@ -167,7 +166,7 @@ def _segment_into(
         used = config.replace(**{'runtime.backend': Config.from_yaml(begun).runtime.backend})
     else:
         used = options.spare_compiling(config, count_clouds(items))
-    with closing(Record(folder, to_yaml(used, title))) as record:
+    with closing(Record(folder, used.to_yaml(title))) as record:
         left = record.find_left(items, force=force)
         if len(left) < len(items):
             print(f'{len(items) - len(left)} of {len(items)} were finished before')

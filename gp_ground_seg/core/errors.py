@@ -1,12 +1,22 @@
-"""Exceptions that carry one clear line for the user."""
+"""What the user is told: errors of one clear line, and messages of the library."""
+
+from __future__ import annotations
 
 import importlib
+import logging
 import shlex
 import sys
 import sysconfig
 import textwrap
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsInt
+
+LOGGER = logging.getLogger('gp_ground_seg')
+"""Of the whole library."""
+Receive = Callable[[int, str], object]
+"""Takes the severity of a message, as in `logging`, and its text."""
 
 
 class GroundSegError(Exception):
@@ -70,3 +80,30 @@ def require(module: str, packages: str) -> Any:
             f'{module.split(".")[0]} is not installed, or does not work here ({error}): '
             f'{install_hint(packages)}'
         ) from error
+
+
+def in_thousands(number: SupportsInt) -> str:
+    """Return a whole number as in ``180 385``."""
+    return f'{int(number):_}'.replace('_', ' ')
+
+
+class _Handler(logging.Handler):
+    def __init__(self, receive: Receive) -> None:
+        super().__init__()
+        self._receive = receive
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._receive(record.levelno, record.getMessage())
+
+
+@contextmanager
+def messages_passed_to(receive: Receive, level: int = logging.INFO) -> Iterator[None]:
+    """Call `receive` with each message of that severity or more within the block."""
+    handler, before = _Handler(receive), LOGGER.level
+    LOGGER.addHandler(handler)
+    LOGGER.setLevel(level)
+    try:
+        yield
+    finally:
+        LOGGER.removeHandler(handler)
+        LOGGER.setLevel(before)

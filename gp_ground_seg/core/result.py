@@ -9,6 +9,7 @@ from typing import Any, Generic, TypeVar, overload
 import numpy as np
 import numpy.typing as npt
 
+from gp_ground_seg.core.errors import in_thousands
 from gp_ground_seg.core.frame import (
     BoolArray,
     Candidates,
@@ -25,7 +26,6 @@ from gp_ground_seg.core.frame import (
     usual_errors,
 )
 from gp_ground_seg.core.gp.learning import Learned, theta_names
-from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.core.pipeline.labels import ground_probability
 from gp_ground_seg.core.pipeline.relief import Relief
 from gp_ground_seg.core.pipeline.residuals import CorrectedSurface, correct_surface

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.log import LOGGER
+from gp_ground_seg.core.errors import LOGGER, PointCloudError
 
 Fields = npt.NDArray[np.void]
 Columns = dict[str, npt.NDArray[Any]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence, Set
@@ -11,7 +10,7 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
-from gp_ground_seg.core.errors import DataError, PointCloudError, shown
+from gp_ground_seg.core.errors import LOGGER, DataError, PointCloudError, shown
 from gp_ground_seg.core.pipeline.points import take_points
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
 from gp_ground_seg.data.bags import BagReader, decode_cloud
@@ -31,7 +30,6 @@ _SCAN_FOLDERS = ('.', 'velodyne', 'samples/LIDAR_TOP')
 _DRIVES = 'sequences/*/velodyne'
 _OUTPUT = re.compile(r'_ground(_ground|_obstacles|_surface)?$')
 """What `segment` adds to the name of a scan whose output goes beside it."""
-_LOGGER = logging.getLogger('gp_ground_seg')
 
 
 @dataclass(frozen=True)
@@ -174,7 +172,7 @@ def _without_output(files: Sequence[Path]) -> Sequence[Path]:
     stems = {_stem(file) for file in files}
     kept = [file for file in files if not _is_output(_stem(file), stems)]
     if n_left_out := len(files) - len(kept):
-        _LOGGER.info('output of earlier runs left out: %d of %d files', n_left_out, len(files))
+        LOGGER.info('output of earlier runs left out: %d of %d files', n_left_out, len(files))
     return kept
 
 

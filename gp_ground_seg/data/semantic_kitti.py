@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.errors import LOGGER, DataError
 from gp_ground_seg.core.frame import BoolArray
 from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, four_columns, read_scan
 from gp_ground_seg.data.files import read_bytes
 
-_LOGGER = logging.getLogger('gp_ground_seg')
 UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70
 """Classes that say neither ground nor obstacle."""
 GROUND_CLASSES = (40, 44, 48, 49, 60, 72)
@@ -128,7 +126,7 @@ def labelled_frames(
     if not frames:
         raise DataError(f'{root}: no sequence has labels, of {", ".join(known)}')
     if left_out:
-        _LOGGER.info('sequences without labels left out: %s', ', '.join(left_out))
+        LOGGER.info('sequences without labels left out: %s', ', '.join(left_out))
     return frames
 
 

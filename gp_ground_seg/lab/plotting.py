@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import ConfigError, require
+from gp_ground_seg.core.errors import ConfigError, in_thousands, require
 from gp_ground_seg.core.frame import OUTSIDE, BoolArray, FloatArray, Label
-from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.points import check_points
 from gp_ground_seg.core.result import Segmentation

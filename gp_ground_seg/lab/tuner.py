@@ -23,9 +23,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import ConfigError, DataError, GroundSegError, require
+from gp_ground_seg.core.errors import (
+    LOGGER,
+    ConfigError,
+    DataError,
+    GroundSegError,
+    in_thousands,
+    require,
+)
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.core.log import LOGGER, in_thousands
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec
 from gp_ground_seg.core.result import Segmentation

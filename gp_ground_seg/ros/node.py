@@ -18,9 +18,14 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.core import log
 from gp_ground_seg.core.backend import Backend, NumpyBackend, choose_backend
-from gp_ground_seg.core.errors import GroundSegError, PointCloudError, in_one_line, shown
+from gp_ground_seg.core.errors import (
+    GroundSegError,
+    PointCloudError,
+    in_one_line,
+    messages_passed_to,
+    shown,
+)
 from gp_ground_seg.core.jit import code_folder, is_code_kept
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import NODE_NAME
@@ -69,7 +74,7 @@ class GroundSegmentationNode(ConfiguredNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(NODE_NAME, **options)
         self._library_log = ExitStack()
-        self._library_log.enter_context(log.passed_to(self._pass_on))
+        self._library_log.enter_context(messages_passed_to(self._pass_on))
         self._frames: FrameListener | None = None
         # A guard condition runs in the executor, between two callbacks.
         self._loaded = self.create_guard_condition(self._change_backend)

@@ -16,7 +16,6 @@ from rclpy.qos import qos_profile_parameters
 
 from gp_ground_seg.core.errors import ConfigError, GroundSegError
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.core.parameters.export import differences
 from gp_ground_seg.core.parameters.removed import removal
 from gp_ground_seg.core.parameters.schema import OF_EVERY_NODE, ParameterSpec
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
@@ -59,7 +58,7 @@ def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
 def describe(config: Config, node_name: str) -> str:
     """Return one line per parameter that is not at its default, and how to see all."""
     lines = []
-    for spec, default, value in differences(Config(), config):
+    for spec, default, value in Config().differences(config):
         unit = f' {spec.unit}' if spec.unit and not isinstance(value, str) else ''
         lines.append(f'\n  {spec.name}: {value}{unit}  (default {default})')
     head = 'parameters that differ from the defaults' if lines else 'parameters: all defaults'

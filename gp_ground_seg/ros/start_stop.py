@@ -30,7 +30,7 @@ from gp_ground_seg.core.errors import (
     reason_of,
     shown,
 )
-from gp_ground_seg.core.parameters.export import file_problems
+from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import ROS_PARAMETERS_KEY, read_yaml
 
 HIGHEST_DOMAIN = 232
@@ -101,7 +101,7 @@ def _check_surroundings(words: Sequence[str]) -> None:
             raise ConfigError(f'{path}: {error}') from error
         if document and not _node_keys(document):
             hint = 'gp-ground-seg config dump writes a file of the form of ROS'
-            if not file_problems(path):
+            if not Config.problems_of_file(path):
                 hint = (
                     'bare groups are good for --config; for the node: gp-ground-seg config dump '
                 )
@@ -116,7 +116,7 @@ def _parameter_files(words: Sequence[str]) -> list[str]:
 def with_file(problem: str, words: Sequence[str]) -> str:
     """Return a problem of the parameters, after the last of the files `words` that has it."""
     for path in reversed(_parameter_files(words)):
-        if problem in file_problems(path):
+        if problem in Config.problems_of_file(path):
             return f'{path}: {problem}'
     return problem
 

@@ -1,4 +1,4 @@
-"""Parameters: their declarations, the check of values, groups as one object, reading of files."""
+"""Parameters: their declarations, the check of values, groups as one object, and their files."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import contextlib
 import dataclasses
 import difflib
 import functools
-import logging
 import numbers
 import re
+import textwrap
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import yaml
 
-from gp_ground_seg.core.errors import ConfigError, in_one_line, reason_of
+from gp_ground_seg.core.errors import LOGGER, ConfigError, in_one_line, reason_of
 from gp_ground_seg.core.parameters.removed import removal
 
 if TYPE_CHECKING:
@@ -38,7 +38,8 @@ MAX_DIGITS = 100  # of an integer; Python cannot print one of more than 4,300
 MAX_DEPTH = 20  # of values in each other: a parameter has five
 YAML_SUFFIXES = ('.yaml', '.yml')
 NO_VALUES = 'no parameters of the segmentation in it'
-_LOGGER = logging.getLogger('gp_ground_seg')
+_WIDTH, _INDENT = 99, '  '  # of the lines of a file that is written
+_NBSP = '\xa0'  # textwrap does not break here
 OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
 """Parameters that every ROS node has."""
 
@@ -78,6 +79,20 @@ class ParameterSpec:
         kind = 'an integer' if self.type is int else 'a number'
         auto = f'{AUTO} or ' if self.auto else ''
         return f'{auto}{kind} in [{self.minimum:g}, {self.maximum:g}]{unit}'
+
+    @property
+    def accepted_briefly(self) -> str:
+        """Accepted values as in a table, without their unit."""
+        if self.choices:
+            return ' or '.join(self.choices)
+        if self.type is bool:
+            return 'true or false'
+        if self.type is str:
+            return 'a name'
+        between = f'{self.minimum:.10g} to {self.maximum:.10g}'
+        if self.type is tuple:
+            return f'{NO_BOX} or six numbers, {between}'
+        return f'{AUTO} or {between}' if self.auto else between
 
     def check(self, value: object) -> ParameterValue:
         """Return `value` in the declared type; ConfigError if it is of another or out of range."""
@@ -235,10 +250,81 @@ class ParameterGroups:
                     f'parameters of node {file.node}; must be of {ROS_NODE_KEY} or {NODE_NAME}'
                 )
             if not file.values:
-                _LOGGER.warning('%s: %s', path, NO_VALUES)
+                LOGGER.warning('%s: %s', path, NO_VALUES)
             return (base or cls()).replace(**file.values)
         except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error
+
+    @classmethod
+    def problems_of_file(cls, path: str | Path) -> list[str]:
+        """Everything wrong with a parameter file, one line each; none if it can be used.
+
+        Rules between parameters are checked where each value by itself is accepted.
+        """
+        problems = []
+        try:
+            file = read_parameters(path)
+            for name, value in file.values.items():
+                try:
+                    cls.find_spec(name).check(value)
+                except ConfigError as error:
+                    problems.append(str(error))
+            if not problems:
+                cls().replace(**file.values)
+        except ConfigError as error:
+            return [str(error)]
+        return problems
+
+    def differences(self, other: Self) -> list[tuple[ParameterSpec, Any, Any]]:
+        """Parameters that differ, with the value here and in `other`, in order of declaration."""
+        pairs = ((spec, self[name], other[name]) for name, spec in self.specs().items())
+        return [(spec, own, value) for spec, own, value in pairs if own != value]
+
+    def to_yaml(self, purpose: str = '', reasons: Mapping[str, str] | None = None) -> str:
+        """Write a ROS parameter file with a comment on each parameter.
+
+        `from_yaml` of it gives the same again, and so does a ROS node. `purpose`, what the file is
+        for, is written at its top, and the reason of a value, by name, above it.
+        """
+        reasons = reasons or {}
+        lines = [
+            *_comment(purpose, 0),
+            '# Parameters of gp_ground_seg, as written by `gp-ground-seg config dump`. To use a '
+            'copy:',
+            '#   ros2 run gp_ground_seg ground_segmentation_node --ros-args --params-file my.yaml',
+            '#   gp-ground-seg segment --config my.yaml ...',
+            f'{ROS_NODE_KEY}:',
+            f'{_INDENT}{ROS_PARAMETERS_KEY}:',
+        ]
+        for k, (group_name, values) in enumerate(self.nested().items()):
+            about = (type(getattr(self, group_name)).__doc__ or '').strip()
+            lines += [*([''] if k else []), *_comment(about, 2), f'{2 * _INDENT}{group_name}:']
+            for field_name, value in values.items():
+                spec = self.find_spec(f'{group_name}.{field_name}')
+                facts = spec.accepted_briefly + (f' {spec.unit}' if spec.unit else '')
+                facts += f'; {spec.symbol} in the paper' if spec.symbol else ''
+                # The facts stay on one line.
+                lines += _comment(f'{spec.description} ' + f'[{facts}]'.replace(' ', _NBSP), 3)
+                if spec.name in reasons:
+                    default = f'(default {yaml_scalar(spec.default)})'.replace(' ', _NBSP)
+                    lines += _comment(f'Here: {reasons[spec.name]} {default}', 3)
+                lines.append(f'{3 * _INDENT}{field_name}: {yaml_scalar(value)}')
+        return '\n'.join(lines) + '\n'
+
+
+def _comment(text: str, depth: int) -> list[str]:
+    prefix = depth * _INDENT + '# '
+    lines = textwrap.wrap(text, _WIDTH - len(prefix), break_on_hyphens=False)
+    return [prefix + line.replace(_NBSP, ' ') for line in lines]
+
+
+def yaml_scalar(value: ParameterValue) -> str:
+    """Write a value the way it is written in a parameter file, quoted where needed."""
+    if isinstance(value, tuple):
+        return f'[{", ".join(map(yaml_scalar, value))}]'
+    text: str = yaml.safe_dump({'x': value}).strip().removeprefix('x: ')
+    # PyYAML writes a frame named 1e5 without quotes: a number, for us as for ROS.
+    return text if load_yaml(text) == value else f"'{value}'"
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.parameters.config import Config, find_preset, find_spec
+from gp_ground_seg.lab.cluster import HERE, Runner
 from gp_ground_seg.lab.experiments.variants import Changes, refuse_changed, score_variants
-from gp_ground_seg.lab.scale.cluster import HERE, Runner
 from gp_ground_seg.lab.scoring.comparison import (
     INTERVAL,
     RMSE,
@@ -18,8 +18,7 @@ from gp_ground_seg.lab.scoring.comparison import (
     interval_text,
     iou_measure,
 )
-from gp_ground_seg.lab.scoring.evaluate import Method, title_of
-from gp_ground_seg.lab.scoring.frames import Scores, sums
+from gp_ground_seg.lab.scoring.evaluate import Method, Scores, sums, title_of
 from gp_ground_seg.lab.scoring.metrics import Measure
 from gp_ground_seg.lab.scoring.peers import InterpolationMethod, PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import (

@@ -7,11 +7,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.lab.cluster import HERE, Runner
 from gp_ground_seg.lab.experiments.variants import TOLD, SimulatedFrame, score_simulated
-from gp_ground_seg.lab.scale.cluster import HERE, Runner
 from gp_ground_seg.lab.scoring.comparison import INTERVAL, RMSE, interval_text, iou_measure
-from gp_ground_seg.lab.scoring.evaluate import title_of
-from gp_ground_seg.lab.scoring.frames import ALL, Scores, each, sums
+from gp_ground_seg.lab.scoring.evaluate import ALL, Scores, each, sums, title_of
 from gp_ground_seg.lab.scoring.metrics import ratio
 from gp_ground_seg.lab.scoring.objects import (
     BAND_TITLES,

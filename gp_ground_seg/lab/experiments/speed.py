@@ -7,20 +7,20 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from gp_ground_seg.core.backend import make_backend
-from gp_ground_seg.core.log import in_thousands
+from gp_ground_seg.core.errors import in_thousands
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.semantic_kitti import Frame, read_points
+from gp_ground_seg.lab.cluster import HERE, Runner
 from gp_ground_seg.lab.experiments.variants import refuse_changed
-from gp_ground_seg.lab.scale.cluster import HERE, Runner
 from gp_ground_seg.lab.scoring.evaluate import (
     PATCHWORKPP,
     KnownScan,
     Method,
     OurMethod,
+    Scores,
     score_methods,
     title_of,
 )
-from gp_ground_seg.lab.scoring.frames import Scores
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import Column, Report, Table
 from gp_ground_seg.lab.scoring.tables import make_report

@@ -18,8 +18,8 @@ from gp_ground_seg.core.frame import OUTSIDE, FloatArray
 from gp_ground_seg.core.parameters.config import PRESETS, Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.semantic_kitti import Frame
+from gp_ground_seg.lab.cluster import HERE, Progress, Runner
 from gp_ground_seg.lab.experiments.variants import refuse_changed
-from gp_ground_seg.lab.scale.cluster import HERE, Progress, Runner
 from gp_ground_seg.lab.scoring.evaluate import OurMethod, as_it_is, load_kitti, score_methods
 from gp_ground_seg.lab.scoring.metrics import height_ratios, height_sums
 from gp_ground_seg.lab.scoring.report import Column, Report, Table, changed_parameters

@@ -14,16 +14,17 @@ from gp_ground_seg.core.errors import ConfigError, PointCloudError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config, find_spec
 from gp_ground_seg.core.parameters.schema import ParameterValue
-from gp_ground_seg.lab.scale.cluster import HERE, Progress, Runner
+from gp_ground_seg.lab.cluster import HERE, Progress, Runner
 from gp_ground_seg.lab.scoring.evaluate import (
     OURS,
     KnownScan,
     Method,
     OurMethod,
+    Scores,
     load_kitti,
+    make_scores,
     score_methods,
 )
-from gp_ground_seg.lab.scoring.frames import Scores, make_scores
 from gp_ground_seg.lab.scoring.objects import CLASSES, LOW_CLASSES, LOW_HEIGHTS, Objects
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
 from gp_ground_seg.lab.simulation import PLACES, SCENES, SENSORS, Kind, Scene, simulate_scan

@@ -16,8 +16,7 @@ import numpy as np
 import scipy.special
 
 from gp_ground_seg.core.frame import FloatArray
-from gp_ground_seg.lab.scoring.evaluate import title_of
-from gp_ground_seg.lab.scoring.frames import KEYS, Scores, sums
+from gp_ground_seg.lab.scoring.evaluate import KEYS, Scores, sums, title_of
 from gp_ground_seg.lab.scoring.metrics import (
     HEIGHT_MEASURES,
     LABEL_MEASURES,

@@ -17,10 +17,9 @@ import numpy as np
 
 import gp_ground_seg
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.parameters.export import differences
 from gp_ground_seg.core.parameters.schema import ParameterValue
 from gp_ground_seg.data.files import write_file
-from gp_ground_seg.lab.scale.cluster import package_versions
+from gp_ground_seg.lab.cluster import package_versions
 
 WIDTH = 100
 """Columns of the terminal that titles and notes are folded to."""
@@ -193,7 +192,7 @@ def machine_line(environment: Mapping[str, Any], backend: str = '') -> str:
 
 def changed_parameters(config: Config) -> dict[str, ParameterValue]:
     """Parameters that differ from their defaults, by dotted name."""
-    return {spec.name: value for spec, _, value in differences(Config(), config)}
+    return {spec.name: value for spec, _, value in Config().differences(config)}
 
 
 def parameters_line(changes: dict[str, ParameterValue]) -> str:

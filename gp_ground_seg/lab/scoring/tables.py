@@ -15,8 +15,17 @@ from gp_ground_seg.lab.scoring.comparison import (
     iou_measure,
     without_one_table,
 )
-from gp_ground_seg.lab.scoring.evaluate import FIT, POSE, title_of
-from gp_ground_seg.lab.scoring.frames import ALL, KEYS, Scores, each, sums, with_all
+from gp_ground_seg.lab.scoring.evaluate import (
+    ALL,
+    FIT,
+    KEYS,
+    POSE,
+    Scores,
+    each,
+    sums,
+    title_of,
+    with_all,
+)
 from gp_ground_seg.lab.scoring.metrics import Measure, height_ratios, label_ratios, ratio
 from gp_ground_seg.lab.scoring.report import (
     Column,

@@ -32,10 +32,8 @@ from typing import Any
 from tqdm import tqdm
 
 import gp_ground_seg
-from gp_ground_seg.core import log
-from gp_ground_seg.core.errors import DataError, in_one_line, require
+from gp_ground_seg.core.errors import LOGGER, DataError, in_one_line, messages_passed_to, require
 
-_LOGGER = logging.getLogger('gp_ground_seg')
 BLOCK_SIZE = 64
 """Items of a block, where there are enough for all workers: they share what a task costs."""
 MAX_RESTARTS = 3
@@ -122,7 +120,7 @@ class Runner:
                     for level, line in notes:
                         if line not in said:
                             said.add(line)
-                            _LOGGER.log(level, '%s', line)
+                            LOGGER.log(level, '%s', line)
                     yield k, result
             if not left:
                 return
@@ -132,7 +130,7 @@ class Runner:
                     f'workers died {n_restarts + 1} times, as where memory is short: fewer '
                     f'--workers have more of it each; the first item that is left is {first}'
                 )
-            _LOGGER.warning('a worker died; computed again: %d blocks', len(left))
+            LOGGER.warning('a worker died; computed again: %d blocks', len(left))
 
 
 HERE = Runner()
@@ -246,7 +244,7 @@ def _compute_block(
     if other:
         line = f'a worker on {platform.node()} has {"; ".join(other)}: last digits may differ'
         notes.append((logging.WARNING, line))
-    with log.passed_to(lambda *message: notes.append(message)):
+    with messages_passed_to(lambda *message: notes.append(message)):
         return function(block, iter), notes
 
 
@@ -260,10 +258,10 @@ def open_runner(
     """
     if scheduler is not None:
         with _connect(scheduler) as client:
-            _LOGGER.info('dashboard: %s', client.dashboard_link)
+            LOGGER.info('dashboard: %s', client.dashboard_link)
             n_workers = sum(client.nthreads().values())
             if not n_workers:
-                _LOGGER.warning('the scheduler has no worker yet, waiting for one')
+                LOGGER.warning('the scheduler has no worker yet, waiting for one')
             yield Runner(bar, partial(_tasks, client), n_workers)
     elif workers is not None:
         most = 4 * (os.cpu_count() or 1)

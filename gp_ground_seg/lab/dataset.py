@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import fcntl
 import json
-import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from gp_ground_seg.core.errors import DataError, PointCloudError
+from gp_ground_seg.core.errors import LOGGER, DataError, PointCloudError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
@@ -30,9 +29,8 @@ from gp_ground_seg.data.files import (
 )
 from gp_ground_seg.data.inputs import Input
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
-from gp_ground_seg.lab.scale.cluster import Progress
+from gp_ground_seg.lab.cluster import Progress
 
-_LOGGER = logging.getLogger('gp_ground_seg')
 RECORD, PARAMETERS = 'outputs.jsonl', 'parameters.yaml'
 TOPICS = {'/ground': Label.GROUND, '/obstacles': Label.OBSTACLE}
 """Of a bag that is written."""
@@ -255,7 +253,7 @@ class Record:
         except BlockingIOError as error:
             raise DataError(f'{self._folder}: another run writes to it') from error
         except OSError:
-            _LOGGER.warning('%s: has no locks, start no other run', self._folder)
+            LOGGER.warning('%s: has no locks, start no other run', self._folder)
 
     def _check_parameters(self, planned: set[str]) -> None:
         """Raise DataError if others are there, of the user or of files that have been written."""
@@ -318,7 +316,7 @@ class Record:
             raise DataError(f'{path}: was changed since it was written, and {aside} is there')
         with writing(aside):
             os.rename(path, aside)
-        _LOGGER.warning('%s: was changed since it was written, is %s now', path, aside.name)
+        LOGGER.warning('%s: was changed since it was written, is %s now', path, aside.name)
 
     def add(self, items: Iterable[Item], outputs: dict[str, list[object]]) -> None:
         """Note that the files of the items are on disk, as `outputs` say."""
