@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import itertools
 from collections.abc import Callable
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -105,7 +104,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate, write the files, print the tables."""
     config = options.read_config(arguments)
-    with options.staged_options(arguments, 'json') as parts, ExitStack() as stack:
+    with options.staged_json(arguments) as path:
         items, load = _items(arguments)
         chosen: list[Method] = [OurMethod(config)]
         changed: list[str] = []
@@ -114,21 +113,21 @@ def run(arguments: argparse.Namespace) -> int:
             chosen.append(OurMethod(other, shown(Path(arguments.against).name)))
         elif arguments.peer is not None:
             chosen.append(PatchworkppMethod.of_sensor(config.sensor))
-        runner = stack.enter_context(options.runner(arguments, 'evaluate'))
-        scores = score_methods(items, chosen, load, runner=runner)
+        with options.runner(arguments, 'evaluate') as runner:
+            scores = score_methods(items, chosen, load, runner=runner)
         cut = _cut_of(arguments)
         report = tables.evaluation(scores, config, runner.n_workers, cut)
         report.facts.update(data=arguments.root, cut=cut)
         environment = results.describe_environment(*(['pypatchworkpp'] if arguments.peer else []))
         environment['n_workers'] = runner.n_workers
-        if 'json' in parts:
-            report.write(parts['json'], environment)
+        if path is not None:
+            report.write(path, environment)
     if changed:
         print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
     lines = [results.parameters_line(report.facts['config_changes'])]
     lines.append(results.machine_line(environment, report.backend))
     print(results.written(report.tables.values(), lines, markdown=arguments.markdown))
-    if 'json' in parts:
+    if path is not None:
         print(f'every number: {shown(arguments.json)}')
     print('', *_result_lines(scores), sep='\n')
     return 0

@@ -125,16 +125,16 @@ def run(arguments: argparse.Namespace) -> int:
     config = options.read_config(arguments)
     more: dict[str, Any] = {'with_peer': not arguments.no_peer} if experiment.has_peer else {}
     packages = ['pypatchworkpp'] if any(more.values()) else []
-    with options.staged_options(arguments, 'json') as parts:
+    with options.staged_json(arguments) as path:
         with options.runner(arguments, arguments.experiment) as runner:
             report = experiment.run(_scans(arguments, experiment), config, runner, **more)
             n_workers = runner.n_workers
         environment = describe_environment(*packages)
         environment['n_workers'] = n_workers
-        if 'json' in parts:
+        if path is not None:
             given = {name: getattr(arguments, name) for name in map(_name, experiment.options)}
             report.facts.update(experiment=arguments.experiment, options=given)
-            report.write(parts['json'], environment)
+            report.write(path, environment)
     lines = [machine_line(environment, report.backend)]
     print(written(report.tables.values(), lines, markdown=arguments.markdown))
     return 0

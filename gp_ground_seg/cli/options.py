@@ -6,8 +6,8 @@ import argparse
 import logging
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -249,15 +249,11 @@ def library_notes(level: int = logging.INFO) -> AbstractContextManager[None]:
     return messages_passed_to(lambda _, text: note(text), level)
 
 
-@contextmanager
-def staged_options(arguments: argparse.Namespace, *names: str) -> Iterator[dict[str, Path]]:
-    """Yield a path for each of the options given; the files appear when the block ends well."""
-    with ExitStack() as stack:
-        yield {
-            name: stack.enter_context(staged_file(path, force=arguments.force))
-            for name in names
-            if (path := getattr(arguments, name)) is not None
-        }
+def staged_json(arguments: argparse.Namespace) -> AbstractContextManager[Path | None]:
+    """Return a path for ``--json``, for a ``with`` block, at whose end the file appears."""
+    if arguments.json is None:
+        return nullcontext()
+    return staged_file(arguments.json, force=arguments.force)
 
 
 def note_leftovers(target: Path, *, quiet: bool = False) -> None:

@@ -231,7 +231,7 @@ class Frame(NamedTuple):
     pseudo: PseudoInputs
     # (C,) candidates that join the inliers if the one before them has joined
     continues_line: BoolArray
-    in_face: BoolArray  # (C,) candidates in vertical faces, which they may be a part of
+    in_face: BoolArray  # (C,) whether the tile of a candidate has a vertical face
     knots: FloatArray  # (K,) ranges where the surface is wanted [m], read-only
     prior_mean: float  # prior mean of the ground's height [m]
 

@@ -16,6 +16,7 @@ from gp_ground_seg.core.parameters import config
 _Group = TypeVar('_Group')
 
 
+@lru_cache
 def tuple_type(group: type[Any]) -> type[Any]:
     """Named tuple type of the numbers of a group.
 
@@ -34,7 +35,7 @@ def tuple_type(group: type[Any]) -> type[Any]:
     return namedtuple(group.__name__, names, module=__name__)
 
 
-# numba pickles a type with the code it keeps, by module and name: each needs its own.
+# numba pickles a type with the code it keeps, by module and name: each is there under its own.
 LinesConfig = tuple_type(config.LinesConfig)
 LengthScaleConfig = tuple_type(config.LengthScaleConfig)
 ObservationConfig = tuple_type(config.ObservationConfig)
@@ -44,24 +45,10 @@ LearningConfig = tuple_type(config.LearningConfig)
 FacesConfig = tuple_type(config.FacesConfig)
 LabelConfig = tuple_type(config.LabelConfig)
 
-_TUPLE_TYPES: dict[str, Any] = {
-    kind.__name__: kind
-    for kind in (
-        LinesConfig,
-        LengthScaleConfig,
-        ObservationConfig,
-        LatentConfig,
-        GrowthConfig,
-        LearningConfig,
-        FacesConfig,
-        LabelConfig,
-    )
-}
-
 
 @lru_cache(maxsize=64)
 def numbers_of(group: _Group) -> _Group:
     """Return the numbers of a group under the same names."""
-    kind = _TUPLE_TYPES[type(group).__name__]
+    kind = tuple_type(type(group))  # type: ignore[arg-type]
     values = [getattr(group, name) for name in kind._fields]
     return cast(_Group, kind(*values))

@@ -59,7 +59,7 @@ def evaluation(
     tables: dict[str, Table] = {}
     has_labels = bool(scores.conventions)
     if has_labels:
-        tables |= {one.key: _convention_table(scores, one) for one in metrics.CONVENTIONS}
+        tables |= {rule.key: _convention_table(scores, rule) for rule in metrics.CONVENTIONS}
     for other in scores.methods[1:]:
         if has_labels:
             tables['differences'] = _iou_differences(scores, other)
@@ -143,8 +143,8 @@ def _convention_table(scores: Scores, convention: metrics.Convention) -> Table:
 def _iou_differences(scores: Scores, other: str) -> Table:
     """Differences of the IoU over all sequences: by convention, and by range."""
     cases = {
-        f'all, {one.title} convention': (scores.scans, iou_measure(one.key))
-        for one in metrics.CONVENTIONS
+        f'all, {rule.title} convention': (scores.scans, iou_measure(rule.key))
+        for rule in metrics.CONVENTIONS
     }
     for title in metrics.RING_TITLES:
         cases[title] = scores.rings[scores.rings['range'] == title], iou_measure()
