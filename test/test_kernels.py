@@ -9,8 +9,13 @@ from hypothesis import strategies as st
 from gp_ground_seg.core.compiled import numerics
 from gp_ground_seg.core.compiled.numerics import exp_neg
 from gp_ground_seg.core.gp import kernels as covariances
-from gp_ground_seg.core.gp.kernels import paciorek, squared_exponential
-from gp_ground_seg.core.gp.linalg import SEGMENTS_PER_BATCH, Padded, batches
+from gp_ground_seg.core.gp.kernels import (
+    SEGMENTS_PER_BATCH,
+    Padded,
+    batches,
+    paciorek,
+    squared_exponential,
+)
 from gp_ground_seg.core.jit import JIT_ENABLED
 
 

@@ -26,15 +26,16 @@ from gp_ground_seg.core.gp.evidence import (
     seeds,
     uses_neighbours_in,
 )
-from gp_ground_seg.core.gp.kernels import paciorek, prior_variance
-from gp_ground_seg.core.gp.latent import given_log_length_scales, latent_log_length_scales
-from gp_ground_seg.core.gp.linalg import (
+from gp_ground_seg.core.gp.kernels import (
     Padded,
     add_noise,
     batches,
     inverse_of_lower,
+    paciorek,
+    prior_variance,
     single_threaded_blas,
 )
+from gp_ground_seg.core.gp.latent import given_log_length_scales, latent_log_length_scales
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, GrowthConfig
 

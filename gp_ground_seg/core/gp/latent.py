@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Frame, IntArray
-from gp_ground_seg.core.gp.kernels import squared_exponential
-from gp_ground_seg.core.gp.linalg import Padded, add_noise, batches
+from gp_ground_seg.core.gp.kernels import Padded, add_noise, batches, squared_exponential
 from gp_ground_seg.core.parameters.config import LengthScaleConfig
 
 MAX_ABS_LOG_LENGTH_SCALE = 100.0

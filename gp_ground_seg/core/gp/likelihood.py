@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Inliers, IntArray
-from gp_ground_seg.core.gp.kernels import paciorek, squared_exponential
+from gp_ground_seg.core.gp.kernels import paciorek, single_threaded_blas, squared_exponential
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
-from gp_ground_seg.core.gp.linalg import single_threaded_blas
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
