@@ -129,7 +129,7 @@ def test_a_node_that_ends_is_said_and_one_that_runs_ends_with_its_block(rclpy, t
         assert is_running(node.pid)
         raise ZeroDivisionError
     assert not is_running(node.pid)
-    from gp_ground_seg.ros.node import CHANGED, FOLLOWS, STAYS
+    from gp_ground_seg.ros.start_stop import CHANGED, FOLLOWS, STAYS
 
     for text, is_settled in (('', 1), (FOLLOWS, 0), (FOLLOWS + CHANGED, 1), (FOLLOWS + STAYS, 1)):
         log.write_text(text)

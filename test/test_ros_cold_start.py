@@ -10,10 +10,10 @@ from cli_runner import run
 from ros_helpers import street, to_message
 
 from gp_ground_seg import Config
+from gp_ground_seg.core import jit, segmenter
 from gp_ground_seg.core.jit import HAVE_NUMBA, code_folder
-from gp_ground_seg.ros import node as node_module
-from gp_ground_seg.ros.node import CHANGED, FOLLOWS, STAYS, BackendLoader
-from gp_ground_seg.ros.start_stop import child_command
+from gp_ground_seg.ros import start_stop
+from gp_ground_seg.ros.start_stop import CHANGED, FOLLOWS, STAYS, BackendLoader, child_command
 
 pytestmark = pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
 
@@ -53,14 +53,14 @@ def test_node_segments_while_its_code_is_compiled_and_then_changes_over(monkeypa
 @pytest.fixture
 def held_back(monkeypatch):
     """`warm_up` waits for this event."""
-    event, real = threading.Event(), node_module.warm_up
+    event, real = threading.Event(), segmenter.warm_up
 
     def warm_up_later(config):
         event.wait(60.0)
         return real(config)
 
-    monkeypatch.setattr(node_module, 'warm_up', warm_up_later)
-    monkeypatch.setattr(node_module, 'is_code_kept', lambda: True)
+    monkeypatch.setattr(segmenter, 'warm_up', warm_up_later)
+    monkeypatch.setattr(jit, 'is_code_kept', lambda: True)
     return event
 
 
@@ -96,8 +96,8 @@ def test_numpy_asked_for_meanwhile_stays(b, held_back):
 
 
 def test_a_failure_is_a_warning_and_the_node_goes_on(monkeypatch, tmp_path):
-    monkeypatch.setattr(node_module, 'is_code_kept', lambda: False)
-    monkeypatch.setattr(node_module, '_COMPILE', "raise OSError('no space left')")
+    monkeypatch.setattr(jit, 'is_code_kept', lambda: False)
+    monkeypatch.setattr(start_stop, '_COMPILE', "raise OSError('no space left')")
     with ros.stderr_in(tmp_path) as stderr, ros.bench(settled=False) as b:
         assert 'OSError: no space left' in ros.said_by(stderr, STAYS)
         b.segment(to_message(street(1000)))

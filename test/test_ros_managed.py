@@ -16,7 +16,7 @@ from ros_helpers import street, to_message, wait_for
 from gp_ground_seg.core.backend import choose_backend
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.ros.node import FOLLOWS
+from gp_ground_seg.ros.start_stop import FOLLOWS
 
 START = (
     '-c', 'import sys; from gp_ground_seg.cli.node import main_managed; sys.exit(main_managed())',

@@ -1,24 +1,27 @@
-"""The ROS 2 node: clouds in, ground and obstacles out; compiled code is made meanwhile."""
+"""The ROS 2 node, clouds in, ground and obstacles out; and as a managed node, with its bond."""
 
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import logging
 import os
-import subprocess
 import sys
-import threading
 import time
+import uuid
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 import rclpy
+from lifecycle_msgs.srv import ChangeState
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.core.backend import Backend, NumpyBackend, choose_backend
+from gp_ground_seg.core.backend import NumpyBackend, choose_backend
 from gp_ground_seg.core.errors import (
     GroundSegError,
     PointCloudError,
@@ -26,18 +29,17 @@ from gp_ground_seg.core.errors import (
     messages_passed_to,
     shown,
 )
-from gp_ground_seg.core.jit import code_folder, is_code_kept
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.core.segmenter import GroundSegmenter, warm_up
+from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.ros import start_stop
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts, kept_height
-from gp_ground_seg.ros.input import THROTTLED, CloudSubscription, clock_fault
+from gp_ground_seg.ros.input import STEADY_CLOCK, THROTTLED, CloudSubscription, clock_fault
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
-from gp_ground_seg.ros.start_stop import child_command
+from gp_ground_seg.ros.start_stop import CHANGED, FOLLOWS, STAYS, BackendLoader
 from gp_ground_seg.ros.transforms import (
     CloudFrames,
     FrameListener,
@@ -47,16 +49,15 @@ from gp_ground_seg.ros.transforms import (
     require_tf2,
 )
 
-FOLLOWS = (
-    'segmenting with numpy until the compiled code is there: a second, or 20 to 60 s to compile it'
-)
-CHANGED = 'segmenting with numba now'
-STAYS = 'segmenting with numpy from now on'
-JOIN_TIMEOUT = 0.5  # longest wait for the thread [s]
-
-# Looking for garbage less often, as the commands do, saves a tenth of the time.
-_COMPILE = 'import gc; gc.set_threshold(50_000); ' + (
-    'from gp_ground_seg.core.segmenter import warm_up; warm_up()'
+# From one heartbeat to the next [s], as of Nav2's own nodes: the manager connects after the first,
+# and waits half of its bond_timeout for one.
+BOND_PERIOD = 0.1
+BOND_TIMEOUT = 4.0  # without one until the node is taken for dead [s]: the manager's own default
+BOND_DEPTH = 5
+LAST_WORDS = Duration(seconds=0.5)  # longest wait until the end of a bond is delivered
+NO_BOND = (
+    'package bond is not installed (apt install ros-jazzy-bond): set bond_timeout: 0.0 on a '
+    'lifecycle manager of this node'
 )
 
 
@@ -240,101 +241,128 @@ class GroundSegmentationNode(ConfiguredNode):
         return facts, self._outputs.n_subscribers()
 
 
-class BackendLoader:
-    """Makes the compiled backend in a thread, while frames are segmented without it.
+class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[misc]
+    """A `GroundSegmentationNode` that is told when to begin, by the transitions of ROS.
 
-    `on_done` is called there when the backend is made or cannot be made; not after `stop`.
+    *configure* makes the compiled backend and waits for it; *activate* subscribes, and begins the
+    bond that Nav2's lifecycle manager waits for; *deactivate* ends both; *cleanup*, *shutdown* and
+    an error free the backend. Parameters can be set in every state. Options are those of
+    `rclpy.node.Node`.
     """
 
-    error = ''
-    seconds = 0.0
-    is_ready = False
-    """Whether `take_backend` has a result that was not taken yet."""
-    _backend: Backend | None = None
-    _is_stopped = False
-    _compiler: subprocess.Popen[bytes] | None = None
-    _thread: threading.Thread | None = None
+    _is_configured = _is_active = False
+    _heartbeat: Heartbeat | None = None
 
-    def __init__(self, on_done: Callable[[], None]) -> None:
-        self._on_done = on_done
-        self._lock = threading.Lock()
+    def __init__(self, stop: start_stop.StopRequest, **options: Any) -> None:
+        self._stop = stop
+        GroundSegmentationNode.__init__(self, **options)
+        LifecycleNodeMixin.__init__(self)
+        # Where a transition is impossible, rclpy's own callback raises, and nobody is answered.
+        for service in self.services:
+            if service.srv_type is ChangeState:
+                service.callback = partial(self._answer, service.callback)
 
-    @property
-    def is_started(self) -> bool:
-        """Whether `start` has been called."""
-        return self._thread is not None
+    def _answer(self, change: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
+        """Do what rclpy's callback `change` does; refuse a transition that there is not."""
+        try:
+            return change(request, response)
+        except RuntimeError:  # of rcl
+            response.success = False
+            wanted = f'{request.transition.id} {shown(request.transition.label)}'.strip()
+            text = f'transition {wanted} refused: it is not possible in the present state'
+            self.get_logger().warning(text, **THROTTLED)
+            return response
 
-    @property
-    def is_busy(self) -> bool:
-        """Whether the thread runs."""
-        return self._thread is not None and self._thread.is_alive()
+    def _load_backend(self, config: Config) -> None:
+        if self._is_configured:
+            super()._load_backend(config)
 
-    def start(self, config: Config) -> None:
-        """Begin to make the backend for `config`."""
-        self._thread = threading.Thread(target=self._run, args=(config,), daemon=True)
-        self._thread.start()
+    def _why_idle(self) -> str:
+        return super()._why_idle() if self._is_active else 'the node is not active'
 
-    def take_backend(self) -> Backend | None:
-        """Return the backend, once; None if it cannot be made, and `error` says why."""
-        backend, self._backend, self.is_ready = self._backend, None, False
-        return backend
+    def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Make the compiled backend; fail if the process is asked to end meanwhile."""
+        self._is_configured = True
+        self._load_backend(self.config)
+        while self._loader.is_busy:
+            if self._stop.made:
+                return TransitionCallbackReturn.FAILURE
+            time.sleep(0.02)
+        self._change_backend()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _set_active(self, is_active: bool) -> TransitionCallbackReturn:
+        self._is_active = is_active
+        self._input.review()
+        if self._heartbeat is not None:
+            self._heartbeat.stop()
+            self._heartbeat = None
+        if is_active and (message := find_message()) is not None:
+            self._heartbeat = Heartbeat(self, message)
+        elif is_active:
+            self.get_logger().info(NO_BOND)
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Subscribe."""
+        return self._set_active(True)
+
+    def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """End the subscription."""
+        return self._set_active(False)
+
+    def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Free the backend."""
+        self._is_configured = False
+        self._loader.close()
+        self._make_segmenter()
+        return self._set_active(False)
+
+    on_shutdown = on_error = on_cleanup
+
+
+def find_message() -> Any:
+    """Return the type bond/msg/Status, None where the package is not installed."""
+    try:
+        from bond.msg import Status
+    except ImportError:
+        return None
+    return Status
+
+
+class Heartbeat:
+    """Says on ``bond`` that a node lives, from its making until `stop`, which says the end of it.
+
+    `message` is the type bond/msg/Status. The name of the node is the name of the bond, as Nav2's
+    own nodes have it. It beats in the executor: a node that hangs is not alive.
+    """
+
+    def __init__(self, node: Node, message: Any) -> None:
+        self._node, self._message = node, message
+        # Each bond is a new one: the manager takes an old one for dead.
+        self._instance = str(uuid.uuid4())
+        self._publisher = node.create_publisher(message, 'bond', BOND_DEPTH)
+        self._timer = node.create_timer(BOND_PERIOD, self._beat, clock=STEADY_CLOCK)
+        self._beat()
+
+    def _beat(self, is_active: bool = True) -> None:
+        status = self._message(
+            id=self._node.get_name(),
+            instance_id=self._instance,
+            active=is_active,
+            heartbeat_timeout=BOND_TIMEOUT,
+            heartbeat_period=BOND_PERIOD,
+        )
+        status.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(status)
 
     def stop(self) -> None:
-        """End the compiling process; `on_done` is not called from now on."""
-        with self._lock:
-            self._is_stopped = True
-            if self._compiler is not None:
-                self._compiler.kill()
-
-    def close(self) -> None:
-        """Stop, and wait for the thread.
-
-        A thread that compiles in this process, as where no folder can keep the code, does so for
-        20 to 60 s: nobody waits for it.
-        """
-        self.stop()
-        if self._thread is not None:
-            self._thread.join(JOIN_TIMEOUT)
-
-    def _run(self, config: Config) -> None:
-        start = time.monotonic()
-        backend = None
-        try:
-            # What is kept is known once the compiled functions are declared.
-            importlib.import_module('gp_ground_seg.core.compiled.backend')
-            if code_folder() is not None and not is_code_kept():
-                self._compile()
-            if not self._is_stopped:
-                # A given height is not that of the scan which is segmented for this.
-                backend = warm_up(dataclasses.replace(config, sensor=Config().sensor))
-        except Exception as error:
-            self.error = f'{type(error).__name__}: {error}'
-        self.seconds = time.monotonic() - start
-        with self._lock:
-            if not self._is_stopped:
-                self._backend, self.is_ready = backend, True
-                self._on_done()
-
-    def _compile(self) -> None:
-        """Compile in a child process, whose memory is free after it: twice what the node needs."""
-        with self._lock:
-            if self._is_stopped:
-                return
-            pipe, nowhere = subprocess.PIPE, subprocess.DEVNULL
-            self._compiler = subprocess.Popen(
-                child_command(_COMPILE),
-                cwd='/',
-                stdin=pipe,
-                stdout=nowhere,
-                stderr=pipe,
-            )
-        with self._compiler:
-            assert self._compiler.stderr is not None
-            said = self._compiler.stderr.read().decode(errors='replace').strip()
-            code = self._compiler.wait()
-        if code and not self._is_stopped:
-            reason = said.splitlines()[-1] if said else f'exit code {code}'
-            raise RuntimeError(f'the compiling process failed: {reason}')
+        """Say that the bond ends on purpose."""
+        self._beat(False)
+        # A publisher that is destroyed takes with it what is not yet delivered.
+        self._publisher.wait_for_all_acked(LAST_WORDS)
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_publisher(self._publisher)
 
 
 def _spin(node: GroundSegmentationNode, stop: start_stop.StopRequest) -> None:
@@ -353,13 +381,8 @@ def _spin(node: GroundSegmentationNode, stop: start_stop.StopRequest) -> None:
                 node.get_logger().error(reason, **THROTTLED)
 
 
-def main(
-    args: Sequence[str] | None = None,
-    make_node: Callable[[start_stop.StopRequest], GroundSegmentationNode] = (
-        lambda _stop: GroundSegmentationNode()
-    ),
-) -> int:
-    """Run the node until a signal or a shutdown; return 0, or 2 for an error at start."""
+def main(args: Sequence[str] | None = None, *, is_managed: bool = False) -> int:
+    """Run a node until a signal or a shutdown; return 0, or 2 for an error at start."""
     words = [NODE_NAME, *(sys.argv[1:] if args is None else args)]
     node = None
     with start_stop.stop_on_signals() as stop:
@@ -367,7 +390,7 @@ def main(
             # Both outputs at once are more than stock Fast DDS sends without loss.
             with start_stop.large_cloud_transport():
                 start_stop.initialize(words)
-                node = make_node(stop)
+                node = ManagedNode(stop) if is_managed else GroundSegmentationNode()
             for line in start_stop.unused_files(words, node.get_fully_qualified_name()):
                 node.get_logger().warning(line)
             _spin(node, stop)

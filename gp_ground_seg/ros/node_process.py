@@ -17,6 +17,9 @@ from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_stamp
 from gp_ground_seg.data.point_cloud2 import CloudMessage
 from gp_ground_seg.ros.start_stop import (
+    CHANGED,
+    FOLLOWS,
+    STAYS,
     Session,
     child_command,
     large_cloud_transport,
@@ -67,8 +70,6 @@ class NodeProcess:
 
     def is_settled(self) -> bool:
         """Return whether it has the backend that it keeps."""
-        from gp_ground_seg.ros.node import CHANGED, FOLLOWS, STAYS
-
         said = self._said()
         return FOLLOWS not in said or CHANGED in said or STAYS in said
 
