@@ -123,14 +123,12 @@ def add_cluster(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def runner(
-    arguments: argparse.Namespace, title: str, unit: str = 'frame'
-) -> AbstractContextManager[Runner]:
+def runner(arguments: argparse.Namespace, title: str) -> AbstractContextManager[Runner]:
     """Return a runner of blocks of frames by the options of `add_cluster`, with a bar."""
     workers, scheduler = arguments.workers, arguments.scheduler
     if workers and scheduler:
         raise DataError('--workers: the cluster of --scheduler has workers, give one of the two')
-    bar = progress(title, quiet=getattr(arguments, 'quiet', False), unit=unit)
+    bar = progress(title, quiet=getattr(arguments, 'quiet', False))
     return open_runner(workers, scheduler, bar)
 
 
@@ -267,9 +265,9 @@ def count(number: int, noun: str) -> str:
     return f'{in_thousands(number)} {noun}{"" if number == 1 else "s"}'
 
 
-def progress(title: str, *, quiet: bool = False, unit: str = 'frame') -> partial[tqdm[Any]]:
+def progress(title: str, *, quiet: bool = False) -> partial[tqdm[Any]]:
     """Progress of items, or of a `total`, on standard error: a bar, or lines if it is a file."""
-    own = {'desc': title, 'unit': unit, 'file': sys.stderr, 'disable': quiet, 'leave': False}
+    own = {'desc': title, 'unit': 'frame', 'file': sys.stderr, 'disable': quiet, 'leave': False}
     if sys.stderr.isatty():
         return partial(tqdm, **own)
     period = LINE_PERIOD

@@ -153,26 +153,20 @@ class Candidates(NamedTuple):
 
     def first(self, n: int) -> Candidates:
         """First `n`, to which `offsets` refer already."""
-        return Candidates(
-            self.r[:n],
-            self.z[:n],
-            self.bin[:n],
-            self.density[:n],
-            self.offsets,
-            self.tile[:n],
-            self.x[:n],
-            self.y[:n],
-        )
+        return self._taken(slice(n), self.offsets)
 
     def where(self, kept: BoolArray) -> Candidates:
         """Those of the (C,) bool mask `kept`."""
         before = np.concatenate([[0], np.cumsum(kept)])
+        return self._taken(kept, before[self.offsets])
+
+    def _taken(self, kept: Any, offsets: IntArray) -> Candidates:
         return Candidates(
             self.r[kept],
             self.z[kept],
             self.bin[kept],
             self.density[kept],
-            before[self.offsets],
+            offsets,
             self.tile[kept],
             self.x[kept],
             self.y[kept],
