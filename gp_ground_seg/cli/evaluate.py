@@ -13,7 +13,7 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import ConfigError, DataError, shown
 from gp_ground_seg.core.parameters.config import Config, config_of
 from gp_ground_seg.data.inputs import Input, list_inputs
-from gp_ground_seg.data.semantic_kitti import Frame, labelled_frames
+from gp_ground_seg.data.semantic_kitti import Frame, is_root, labelled_frames
 from gp_ground_seg.lab.scoring import report as results
 from gp_ground_seg.lab.scoring import tables
 from gp_ground_seg.lab.scoring.evaluate import (
@@ -154,7 +154,7 @@ def _items(
 ) -> tuple[Any, Callable[[Any], KnownScan]]:
     """Return labelled frames, or with ``--against`` any clouds, and the reader of a cloud."""
     root = Path(arguments.root)
-    if any(root.glob('sequences/*/velodyne')):
+    if is_root(root):
         return frames_from_options(arguments), partial(load_kitti, cut=_cut_of(arguments))
     if not root.exists():
         raise DataError(f'{root}: no such file or folder')

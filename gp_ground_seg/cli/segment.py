@@ -18,7 +18,7 @@ from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.cloud_files import FORMATS, LABELS, format_for, read_file
 from gp_ground_seg.data.files import check_writable, flush, writing
 from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
-from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences
+from gp_ground_seg.data.semantic_kitti import is_root, list_frames, list_sequences
 from gp_ground_seg.lab.cluster import cut
 from gp_ground_seg.lab.dataset import (
     PARAMETERS,
@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
     elif holds_bag(source) and arguments.format not in FORMATS:
         bag = _bag_item(source, target.name, arguments, force=arguments.force)
         _segment_to(target, bag, arguments, config)
-    elif _is_root(source):
+    elif is_root(source):
         _segment_into(target, _list_root(arguments), arguments, config)
     else:
         _segment_scans(target, arguments, config)
@@ -185,10 +185,6 @@ def _segment_into(
             if not arguments.quiet:
                 options.note_spared(config, used)
         sweep(folder, items)
-
-
-def _is_root(source: Path) -> bool:
-    return any(True for _ in source.glob('sequences/*/velodyne'))
 
 
 def _list_root(arguments: argparse.Namespace) -> list[Item]:

@@ -43,7 +43,7 @@ class CloudMessage(Protocol):
     is_dense: bool
 
 
-Cloud = TypeVar('Cloud', bound=CloudMessage)
+_Message = TypeVar('_Message', bound=CloudMessage)
 
 
 def read_xyz(
@@ -251,12 +251,12 @@ def _view(cloud: CloudMessage, code: npt.DTypeLike, offset: int = 0) -> npt.NDAr
 
 
 def select_points(
-    cloud: Cloud,
+    cloud: _Message,
     mask: npt.NDArray[np.bool_],
     make_data: Callable[[int], Any] = lambda size: np.empty(size, np.uint8),
     *,
     are_finite: bool = False,
-) -> Cloud:
+) -> _Message:
     """Message of the points where `mask` is true: same header, same fields, one row.
 
     ``is_dense`` says whether the kept points are all finite; they are looked at unless the caller

@@ -74,6 +74,11 @@ def frames(root: str | Path, *sequences: str) -> list[Frame]:
     return [frame for name in chosen for frame in list_frames(root, name)]
 
 
+def is_root(folder: Path) -> bool:
+    """Whether a folder has sequences, as `list_sequences` finds them."""
+    return any(folder.glob('sequences/*/velodyne'))
+
+
 def list_sequences(root: str | Path) -> list[str]:
     """Names of the sequences below ``root/sequences``; raises DataError if there is none."""
     folder = Path(root, 'sequences')
