@@ -279,7 +279,7 @@ class GroundSegmenter:
             scan = backend.build_grid(pose.level(xyz), config)
         images = find_mirror_images(scan, pose, sensor)
         if len(images.points) > 0:
-            scan = backend.build_grid(images.raised(scan.xyz), config)
+            scan = images.left_out(backend.build_grid(images.raised(scan.xyz), config))
         timer.mark('pose')
         return scan, pose, images
 

@@ -21,7 +21,10 @@ from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 DEEP = 0.15
 """Depth below the plane from which a return may be an image [m]: more than that of a kerb."""
 BELOW_SIGHT = 0.03
-"""Depth at which a ray must pass below ground that is seen nearer [m]."""
+"""Depth at which a ray must pass below ground that is seen nearer [m], to tell a wet road."""
+OVER_SIGHT = 0.05
+"""Height at which it may pass over that where the road is wet [m]: of rays that meet the road side
+by side some come back from there, others from what they are mirrored to."""
 NEAREST, GROUND_REACH, IMAGE_REACH = 1.0, 40.0, 60.0
 """Range from which returns may be images, up to which ground tells them, and up to which they are
 told [m]: nearer there may be the robot itself."""
@@ -44,6 +47,13 @@ class MirrorImages(NamedTuple):
         result[self.points, 2] += self.rise.astype(result.dtype)
         return result
 
+    def left_out(self, scan: Scan) -> Scan:
+        """Scan of the points `raised` without candidates that are images."""
+        x, y = scan.xyz[self.points, :2].T
+        candidates = scan.candidates
+        is_image = np.isin(candidates.x + 1j * candidates.y, x + 1j * y)
+        return scan._replace(candidates=candidates.where(~is_image))
+
 
 def find_mirror_images(scan: Scan, pose: SensorPose, sensor: SensorConfig) -> MirrorImages:
     """Find the mirror images of a scan in the level frame: none unless the road is wet.
@@ -65,7 +75,8 @@ def find_mirror_images(scan: Scan, pose: SensorPose, sensor: SensorConfig) -> Mi
         return none
     slope = _slope(r, z, up)
     nearer = _nearer_in_segment(slope, is_ground, candidates.segment[near])
-    if np.count_nonzero(_is_image(r, z, slope, nearer, heights)) <= most_if_dry:
+    found = _is_image(r, z, slope, nearer, heights, BELOW_SIGHT)
+    if np.count_nonzero(found) <= most_if_dry:
         return none
     inside = np.flatnonzero(grid.inside)
     r, z = grid.r[inside].astype(np.float64), scan.xyz[inside, 2].astype(np.float64)
@@ -73,7 +84,7 @@ def find_mirror_images(scan: Scan, pose: SensorPose, sensor: SensorConfig) -> Mi
     is_ground = np.abs(z + pose.height) <= tolerance_at(r)
     is_ground &= (r >= NEAREST) & (r < GROUND_REACH)
     nearer = _nearer_about(slope[is_ground], cell[is_ground], (grid.n_segments, grid.n_bins))[cell]
-    found = _is_image(r, z, slope, nearer, heights)
+    found = _is_image(r, z, slope, nearer, heights, -OVER_SIGHT)
     return MirrorImages(inside[found], -2.0 * (z[found] + pose.height))
 
 
@@ -120,11 +131,12 @@ def _is_image(
     slope: FloatArray,
     nearer: FloatArray,
     heights: tuple[float, float],
+    least: float,
 ) -> BoolArray:
-    """Whether returns (P,) are deep, and below the line of sight to ground that is nearer.
+    """Whether returns (P,) are deep, and `least` below the line of sight to ground that is nearer.
 
     `slope` and `nearer` are those of the lines of sight to each and to that ground, `heights`
-    those of the plane of the ground and of the sensor [m].
+    those of the plane of the ground and of the sensor, and `least` is measured there [m].
     """
     plane_z, sensor_z = heights
     # Only a line of sight that points down meets the plane: at its height over its slope.
@@ -132,5 +144,5 @@ def _is_image(
     chosen = np.flatnonzero(may_be & (nearer > -np.inf))
     below = (nearer[chosen] - slope[chosen]) * (sensor_z - plane_z)
     result = np.zeros(len(z), dtype=np.bool_)
-    result[chosen[below > -BELOW_SIGHT * nearer[chosen]]] = True
+    result[chosen[below > -least * nearer[chosen]]] = True
     return result
