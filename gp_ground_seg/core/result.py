@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -34,32 +35,37 @@ LEAST_GROUND = 0.001
 """Share of the points below which next to nothing of a scan is ground."""
 NO_GROUND = 'next to nothing of the scan is ground: is sensor.height right, and z up?'
 
-if TYPE_CHECKING:
-    from functools import cached_property as cached_property
-else:
+_Value = TypeVar('_Value')
 
-    class cached_property:  # noqa: N801 - a decorator
-        """``functools.cached_property`` as it is from Python 3.12 on: without a lock.
 
-        The lock of older versions is one for all objects of the class: a process forked while a
-        thread computes the property of any of them would wait for it for ever. Two threads that
-        ask one object at once may both compute the value, which is the same.
-        """
+class cached_property(Generic[_Value]):  # noqa: N801 - a decorator
+    """``functools.cached_property`` as it is from Python 3.12 on: without a lock.
 
-        def __init__(self, compute):
-            self._compute = compute
-            self.__doc__ = compute.__doc__
+    The lock of older versions is one for all objects of the class: a process forked while a
+    thread computes the property of any of them would wait for it for ever. Two threads that ask
+    one object at once may both compute the value, which is the same.
+    """
 
-        def __set_name__(self, owner, name):
-            self._name = name
+    def __init__(self, compute: Callable[[Any], _Value]) -> None:
+        self._compute = compute
+        self.__doc__ = compute.__doc__
 
-        def __get__(self, instance, owner):
-            if instance is None:
-                return self
-            # The next access finds the value in the object and does not come here.
-            with usual_errors():
-                value = instance.__dict__[self._name] = self._compute(instance)
-            return value
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> cached_property[_Value]: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type) -> _Value: ...
+
+    def __get__(self, instance: object | None, owner: type) -> cached_property[_Value] | _Value:
+        if instance is None:
+            return self
+        # The next access finds the value in the object and does not come here.
+        with usual_errors():
+            value = instance.__dict__[self._name] = self._compute(instance)
+        return value
 
 
 @dataclass(frozen=True)
