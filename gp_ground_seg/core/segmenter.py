@@ -168,8 +168,11 @@ class GroundSegmenter:
         # 4. Relief of the land. Lines along each segment, over it, without lowest points of faces
         #    with occluded base, and pseudo-inputs. The prior mean is the ground below the sensor.
         relief, candidates = backend.find_relief(scan.candidates, faces, pose.height, config)
-        extracted = backend.extract_lines(candidates, faces, config)
-        frame = Frame(*extracted, scan.grid.edges, -pose.height)
+        candidates, lines, pseudo, continues_line, in_face = backend.extract_lines(
+            candidates, faces, config
+        )
+        knots, prior_mean = scan.grid.edges, -pose.height
+        frame = Frame(candidates, lines, pseudo, continues_line, in_face, knots, prior_mean)
         timer.mark('lines')
         # 5. Observation and latent process: hyper-parameters theta, inliers and surface.
         is_fixed = config.learning.mode == 'fixed'

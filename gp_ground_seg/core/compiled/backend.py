@@ -211,7 +211,7 @@ class NumbaBackend:
         by_itself = self._surfaces(u, knot_u)
         uses_neighbours = uses_neighbours_in(frame, config)
         max_slope = CLEARLY * slope_std if uses_neighbours else -1.0
-        own_evidence, evidence_table = take('aside', (2, 2, *shape), np.float64)
+        own_evidence, evidence_table = take('evidence', (2, 2, *shape), np.float64)
         odds = evidence.find_seeds(
             frame, theta, growth, max_slope, own_evidence[0], by_itself.seed
         )

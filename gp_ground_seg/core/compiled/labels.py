@@ -195,10 +195,10 @@ def vote(
 
     `lowest` is that of `lowest_of` [m].
     """
-    settled, n_rows = _number_tiles(scan.tiles, has_obstacle, buffers.rows)
+    obstacle_tiles, n_rows = _number_tiles(scan.tiles, has_obstacle, buffers.rows)
     votes = np.zeros((n_rows, N_LAYERS), np.int64)
-    n_voters = _vote(scan, lowest, len(settled), config, result, buffers, votes.reshape(-1))
-    sums = _sum_around(settled, scan.tiles, buffers.rows, votes)
+    n_voters = _vote(scan, lowest, len(obstacle_tiles), config, result, buffers, votes.reshape(-1))
+    sums = _sum_around(obstacle_tiles, scan.tiles, buffers.rows, votes)
     margins, unit = result.margin, config.ground_tolerance / VOTE_UNITS
     for n in range(n_voters):
         i, place = np.uintp(buffers.voters[n]), buffers.places[n]
@@ -219,14 +219,14 @@ def _number_tiles(tiles: Tiles, has_obstacle: BoolArray, rows: CellArray) -> tup
     gets no votes.
     """
     n_sides, n_rows = int(math.sqrt(len(has_obstacle))), 1
-    settled = np.empty(len(tiles.occupied) + 1, np.int32)
+    obstacle_tiles = np.empty(len(tiles.occupied) + 1, np.int32)
     rows[:] = 0
     for tile in tiles.occupied:
         if has_obstacle[np.uintp(tile)]:
-            settled[n_rows], rows[np.uintp(tile)] = tile, n_rows
+            obstacle_tiles[n_rows], rows[np.uintp(tile)] = tile, n_rows
             n_rows += 1
-    settled = settled[:n_rows]
-    for tile in settled[1:]:
+    obstacle_tiles = obstacle_tiles[:n_rows]
+    for tile in obstacle_tiles[1:]:
         column, row = tile // n_sides, tile % n_sides
         for x in range(max(column - 1, 0), min(column + 2, n_sides)):
             for y in range(max(row - 1, 0), min(row + 2, n_sides)):
@@ -234,20 +234,20 @@ def _number_tiles(tiles: Tiles, has_obstacle: BoolArray, rows: CellArray) -> tup
                 if rows[t] == 0 and tiles.extremes[t, 0] < math.inf:
                     rows[t] = n_rows
                     n_rows += 1
-    return settled, n_rows
+    return obstacle_tiles, n_rows
 
 
 @jit(part=True)
 def _vote(
     scan: Scan,
     lowest: float,
-    n_settled: int,
+    n_obstacle_tiles: int,
     config: LabelConfig,
     result: Labelled,
     buffers: VoteBuffers,
     votes: IntArray,
 ) -> int:
-    """Add up the votes in each layer, whole numbers; return the number of voters to settle."""
+    """Add up the votes in each layer, whole numbers; return how many are in obstacle tiles."""
     tolerance, rows, n = config.ground_tolerance, buffers.rows, 0
     z, tile = scan.xyz.T[2], scan.tiles.tile
     for i in range(len(tile)):
@@ -257,18 +257,20 @@ def _vote(
             place = row * N_LAYERS + int(layer_of(over_lowest, tolerance))
             vote = vote_of(result.margin[i], tolerance)
             votes[np.uintp(place)] += VOTER_FLAG + int(vote + VOTE_UNITS)
-            if row < n_settled:
+            if row < n_obstacle_tiles:
                 buffers.voters[n], buffers.places[n] = i, place
                 n += 1
     return n
 
 
 @jit(part=True)
-def _sum_around(settled: CellArray, tiles: Tiles, rows: CellArray, votes: IntArray) -> IntArray:
-    """Sum the votes of each settled tile and the eight around it, layer by layer."""
-    n_sides, sums = int(math.sqrt(len(rows))), np.zeros((len(settled), N_LAYERS), np.int64)
-    for k in range(1, len(settled)):
-        column, row, about = settled[k] // n_sides, settled[k] % n_sides, sums[k]
+def _sum_around(
+    obstacle_tiles: CellArray, tiles: Tiles, rows: CellArray, votes: IntArray
+) -> IntArray:
+    """Sum the votes of each tile with an obstacle and the eight around it, layer by layer."""
+    n_sides, sums = int(math.sqrt(len(rows))), np.zeros((len(obstacle_tiles), N_LAYERS), np.int64)
+    for k in range(1, len(obstacle_tiles)):
+        column, row, about = obstacle_tiles[k] // n_sides, obstacle_tiles[k] % n_sides, sums[k]
         for x in range(max(column - 1, 0), min(column + 2, n_sides)):
             for y in range(max(row - 1, 0), min(row + 2, n_sides)):
                 k_beside = rows[np.uintp(x * n_sides + y)]

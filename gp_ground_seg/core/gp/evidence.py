@@ -131,7 +131,8 @@ def odds_of(n_standing: Values, n_candidates: Values) -> Values:
     """Obstacles for each ground among the candidates of a frame.
 
     `n_standing` of `n_candidates` near the sensor stand on something. Others may, so the odds are
-    at least `ODDS`; and as if these had been seen once before, few candidates prove little.
+    at least `ODDS`. They are those of one obstacle and ``1 / ODDS`` of ground more, so that few
+    candidates change them little.
     """
     seen = (n_standing + 1.0) / (n_candidates - n_standing + 1.0 / ODDS)
     return np.maximum(seen, ODDS)

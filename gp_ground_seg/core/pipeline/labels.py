@@ -217,12 +217,12 @@ def mean_votes(
     shape = len(row_to_place) + 1, N_LAYERS + 2
     layer = layer_of(over_lowest, tolerance).astype(np.int64)
     entry = rows[place] * shape[1] + layer + 1
-    settles = has_obstacle[place]
-    place, layer = place[settles], layer[settles]
+    is_changed = has_obstacle[place]
+    place, layer = place[is_changed], layer[is_changed]
     about = [rows[place + step] * shape[1] + layer for step in around]
 
     def total(weights: FloatArray | None) -> FloatArray:
-        """Sum of votes about the voters that settle: of three layers, each from the lowest on."""
+        """Sum of the votes about the voters to change: of three layers, from the lowest on."""
         layers = np.bincount(entry, weights, shape[0] * shape[1]).reshape(shape)
         layers[:, 0], layers[:, -1] = layers[:, -2], layers[:, 1]
         flat = layers.ravel()
@@ -232,7 +232,7 @@ def mean_votes(
         return sums
 
     mean = total(vote_of(margin[voters], tolerance)) / total(None)
-    return voters[settles], mean * (tolerance / VOTE_UNITS)
+    return voters[is_changed], mean * (tolerance / VOTE_UNITS)
 
 
 def _near_sums(height: FloatArray, tiles: Tiles, in_face: BoolArray, units: float) -> FloatArray:
