@@ -97,8 +97,7 @@ def test_what_a_format_beside_its_points_says_is_kept(tmp_path):
     path = tmp_path / 'a.pcd'
     again = decode_file(path, encode(path, fields, header))
     assert again.header == header
-    part = again.take(np.arange(60) < 10)
-    found = decode_file(path, encode(path, part.fields, part.header))
+    found = decode_file(path, encode(path, again.fields[:10], again.header))
     assert found.header[:3] == (10, 1, header[2])
     path = tmp_path / 'a.ply'
     remarks = PlyHeader(('comment mine',))

@@ -200,11 +200,6 @@ class Lines(NamedTuple):
     slope: FloatArray  # (Q,) slope dz/dr of each line; NaN for a line of one point
     start: IntArray  # (Q + 1,) candidates of line q are ``start[q]:start[q + 1]``
 
-    def extent(self, candidates: Candidates) -> FloatArray:
-        """Horizontal extent of each line, (Q,) float64 [m]."""
-        value: FloatArray = candidates.r[self.start[1:] - 1] - candidates.r[self.start[:-1]]
-        return value
-
 
 class PseudoInputs(NamedTuple):
     """Pseudo-inputs of the latent process."""

@@ -205,11 +205,6 @@ class BagReader(AbstractContextManager['BagReader']):
         encoding = channels[0].encoding
         return types if encoding == 'cdr' else ', '.join(filter(None, (types, encoding)))
 
-    @property
-    def point_cloud_topics(self) -> list[str]:
-        """Names of the PointCloud2 topics."""
-        return [name for name, kind in self.topics.items() if kind == POINT_CLOUD2]
-
     def _list_topics(self) -> str:
         return ', '.join(f'{name} ({kind})' for name, kind in self.topics.items()) or 'none'
 
@@ -221,7 +216,7 @@ class BagReader(AbstractContextManager['BagReader']):
 
     def pick_point_cloud_topic(self, topic: str | None = None) -> str:
         """Return `topic` if it has point clouds, or the only one that has; else a DataError."""
-        clouds = self.point_cloud_topics
+        clouds = [name for name, kind in self.topics.items() if kind == POINT_CLOUD2]
         if topic is not None:
             self.n_messages(topic)
             if topic not in clouds:

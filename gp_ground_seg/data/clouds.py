@@ -48,10 +48,6 @@ class Cloud:
     xyz: npt.NDArray[np.floating]
     header: Any = None
 
-    def take(self, mask: npt.NDArray[np.bool_]) -> Cloud:
-        """Return the points where `mask` is true."""
-        return replace(self, fields=self.fields[mask], xyz=self.xyz[mask])
-
     def join(self, columns: Columns) -> Cloud:
         """Return the cloud with further fields; one whose name is taken is called ``gp_NAME``."""
         joined = scatter(self.fields)
