@@ -1,8 +1,10 @@
 """A node whose compiled code is not there yet: on numpy at first, compiled code in the end."""
 
+import io
 import signal
 import sys
 import threading
+import time
 
 import pytest
 import ros_helpers as ros
@@ -119,6 +121,23 @@ def test_loader_that_is_closed_calls_nobody_and_frees_its_backend(held_back):
 def test_a_child_imports_nothing_from_relative_folders(monkeypatch):
     monkeypatch.setattr(sys, 'path', ['', 'here', *sys.path])
     assert "'here'" not in ' '.join(child_command('pass'))
+
+
+def test_warm_up_shows_how_many_functions_are_ready(monkeypatch, capsys):
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
+    real, states = segmenter.warm_up, iter([(0, 21), (5, 21), (14, 21)])
+
+    def warm_up_slowly():
+        time.sleep(1.0)
+        return real()
+
+    monkeypatch.setattr(sys, 'stderr', terminal)
+    monkeypatch.setattr(segmenter, 'warm_up', warm_up_slowly)
+    monkeypatch.setattr(jit, 'count_ready', lambda: next(states, (14, 21)))
+    assert run('warm-up') == 0
+    assert [text in terminal.getvalue() for text in (' 0/21 ', ' 5/21 ', ' 14/21 ')] == [True] * 3
+    assert capsys.readouterr().out.startswith('compiled code is kept in ')
 
 
 def test_warm_up_command_says_where_the_code_is(capsys):

@@ -265,9 +265,9 @@ def count(number: int, noun: str) -> str:
     return f'{in_thousands(number)} {noun}{"" if number == 1 else "s"}'
 
 
-def progress(title: str, *, quiet: bool = False) -> partial[tqdm[Any]]:
+def progress(title: str, *, quiet: bool = False, unit: str = 'frame') -> partial[tqdm[Any]]:
     """Progress of items, or of a `total`, on standard error: a bar, or lines if it is a file."""
-    own = {'desc': title, 'unit': 'frame', 'file': sys.stderr, 'disable': quiet, 'leave': False}
+    own = {'desc': title, 'unit': unit, 'file': sys.stderr, 'disable': quiet, 'leave': False}
     if sys.stderr.isatty():
         return partial(tqdm, **own)
     period = LINE_PERIOD

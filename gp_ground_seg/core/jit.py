@@ -350,9 +350,15 @@ def has_to_compile() -> bool:
     return JIT_ENABLED and not (_is_whole() or (code_folder() is not None and _is_warm))
 
 
+def count_ready() -> tuple[int, int]:
+    """How many functions are compiled or loaded in this process, and how many there are."""
+    return sum(bool(entry.overloads) for entry in _entry_points), len(_entry_points)
+
+
 def _is_whole() -> bool:
     """Whether each function that is called from Python is compiled or loaded in this process."""
-    return bool(_entry_points) and all(entry.overloads for entry in _entry_points)
+    n_ready, n_functions = count_ready()
+    return 0 < n_functions == n_ready
 
 
 def is_code_kept() -> bool:
