@@ -374,7 +374,9 @@ class Reference(NumpyBackend):
         return scan._replace(candidates=lowest_of_cells(scan, config))
 
     def find_relief(self, candidates, faces, height, config):
-        relief = Relief.of(find_relief(candidates, faces, height, config))
+        before, behind, is_behind = find_relief(candidates, faces, height, config)
+        pieces = np.where(is_behind[..., None], *(Relief.of(h).pieces for h in (behind, before)))
+        relief = Relief(pieces)
         return relief, candidates._replace(z=candidates.z - relief.at(candidates.x, candidates.y))
 
     def extract_lines(self, candidates, faces, config):

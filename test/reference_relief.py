@@ -7,72 +7,117 @@ import numpy as np
 
 
 def find_relief(candidates, faces, height, config):
-    """Heights of the relief in the middle of each square, (60, 60)."""
-    land = np.zeros((60, 60))
+    """Heights in the middle of each square of the land before falls, and of that behind them.
+
+    Also which pieces are of the latter. Two of (60, 60), and (59, 59).
+    """
+    lands, is_behind = np.zeros((2, 60, 60)), np.zeros((59, 59), dtype=bool)
     if config.surface.look_aside:
-        reached = sorted(reached_on_foot(candidates, faces, height, config))
-        x, y, z = (value[reached] for value in (candidates.x, candidates.y, candidates.z + height))
-        known, occupied = fit_squares(x, y, z)
-        for square in raised_parts(known, occupied):
-            del known[square]
-        if any(abs(h) > 0.15 for h in known.values()):
-            fill_rings(known)
-            for square, h in known.items():
-                share = min(max((abs(h) - 0.15) / 0.3, 0.0), 1.0)
-                land[square] = h * (3.0 * share**2 - 2.0 * share**3)
-    return land
+        known, pieces = [], []
+        for side in map(sorted, reached_on_foot(candidates, faces, height, config)):
+            x, y, z = (getattr(candidates, name)[side] for name in 'xyz')
+            heights, occupied = fit_squares(x, y, z + height)
+            for square in raised_parts(heights, occupied):
+                del heights[square]
+            known.append(heights)
+            pieces.append(pieces_on(heights, x, y))
+        if any(abs(h) > 0.15 for heights in known for h in heights.values()):
+            for land, heights in zip(lands, known, strict=True):
+                fill_rings(heights)
+                for square, h in heights.items():
+                    share = min(max((abs(h) - 0.15) / 0.3, 0.0), 1.0)
+                    land[square] = h * (3.0 * share**2 - 2.0 * share**3)
+            for piece in np.ndindex(59, 59):
+                before, behind = (rings_to(piece, own) for own in pieces)
+                is_behind[piece] = behind < before
+    return *lands, is_behind
+
+
+def pieces_on(heights, x, y):
+    """Pieces, each between the middles of four squares, with places in squares of a height."""
+    squares = squares_of(x, y)
+    places = [(a, b) for a, b, square in zip(x, y, squares, strict=True) if square in heights]
+    return {tuple(min(max(int((v + 59.0) // 2.0), 0), 58) for v in place) for place in places}
+
+
+def rings_to(piece, others):
+    """Rings of pieces around one up to the nearest of others."""
+    return min((max(abs(piece[0] - i), abs(piece[1] - j)) for i, j in others), default=math.inf)
 
 
 def reached_on_foot(candidates, faces, height, config):
-    """Candidates in the groups, joined by steps, that have eight seeds; raised parts entered."""
+    """Candidates in the groups, joined by steps, that have eight seeds; raised parts entered.
+
+    Those before a fall, and those behind one.
+    """
     r, z, segment = candidates.r, candidates.z, candidates.segment
     n_segments, growth = len(candidates.offsets) - 1, config.growth
     allowed = {c for c in range(len(r)) if r[c] < 60.0 and not faces.is_face[candidates.tile[c]]}
-    beside, steep = {c: set() for c in allowed}, []
+    beside, steep, falls = {c: set() for c in allowed}, [], []
+
+    def join(a, b):
+        beside[a].add(b)
+        beside[b].add(a)
 
     def step(a, b, longest, across):
         rise, distance = abs(z[b] - z[a]), math.hypot(r[b] - r[a], across)
         is_step = {a, b} <= allowed and abs(r[b] - r[a]) <= longest
-        if is_step and rise <= min(0.84 * distance + 0.06, 0.8 if across == 0.0 else 0.3):
-            if rise <= 0.3:
-                beside[a].add(b)
-                beside[b].add(a)
-            else:
-                steep.append((a, b))
+        is_step &= rise <= min(0.84 * distance + 0.06, 0.8 if across == 0.0 else 0.3)
+        if is_step and rise <= 0.3:
+            join(a, b)
+        elif is_step:
+            steep.append((a, b))
+        return is_step
 
     for a in sorted(allowed):
-        if a + 1 < len(r) and segment[a + 1] == segment[a]:
-            if r[a + 1] - r[a] > 1.0 + 0.12 * r[a + 1]:
-                if {a, a + 1} <= allowed and goes_on(candidates, a):
-                    steep.append((a, a + 1))
-            else:
-                step(a, a + 1, 1.0 + 0.12 * r[a + 1], 0.0)
+        if {a, a + 1} <= allowed and segment[a + 1] == segment[a]:
+            gap, dr, rise = 1.0 + 0.12 * r[a + 1], r[a + 1] - r[a], z[a + 1] - z[a]
+            if dr > gap and goes_on(candidates, a):
+                steep.append((a, a + 1))
+            elif not step(a, a + 1, gap, 0.0) and leads_over_edge(dr, rise):
+                falls.append((a, a + 1))
         for aside in (1, 2):
             own = np.flatnonzero(segment == (segment[a] + aside) % n_segments)
             across = aside * 2.0 * math.pi / n_segments * r[a]
             for b in (*own[r[own] < r[a]][-1:], *own[r[own] >= r[a]][:1]):
                 step(a, int(b), 0.5 * (1.0 + 0.12 * r[a]), across)
-    for front in fronts_of(steep, r, z, segment, n_segments):
-        if sum(2.0 * math.pi / n_segments * r[a] for a, _ in front) >= 6.0:
-            for a, b in front:
-                beside[a].add(b)
-                beside[b].add(a)
-    groups = groups_of(allowed, lambda c: beside[c])
+    fallen = set()
+    for steps in (steep, [(a, b) for a, b in steep + falls if z[b] < z[a]]):
+        for front in fronts_of(steps, r, z, segment, n_segments):
+            if sum(2.0 * math.pi / n_segments * r[a] for a, _ in front) >= 6.0:
+                fallen |= front & set(falls)
+                for a, b in front - set(falls):
+                    join(a, b)
+    raised = {c for c in allowed if z[c] + height > 0.3}
+    land = set(allowed)
+    for part in groups_of(raised, lambda c: beside[c] & raised):
+        entries = {c for c in part if beside[c] - raised}
+        nearest = {
+            segment[c]: min(r[e] for e in entries if segment[e] == segment[c]) for c in entries
+        }
+        if sum(2.0 * math.pi / n_segments * r_entry for r_entry in nearest.values()) < 1.5:
+            land -= part
+    fallen = {step for step in fallen if set(step) <= land}
+    for a, b in fallen:
+        join(a, b)
     seeds = {
         c
         for c in allowed
         if r[c] < growth.seed_range and abs(z[c] + height) < growth.seed_height_tolerance
     }
-    reached = {c for group in groups if len(seeds & group) >= 8 for c in group}
-    raised = {c for c in reached if z[c] + height > 0.3}
-    for part in groups_of(raised, lambda c: beside[c] & raised):
-        entries = {c for c in part if beside[c] & (reached - raised)}
-        nearest = {
-            segment[c]: min(r[e] for e in entries if segment[e] == segment[c]) for c in entries
-        }
-        if sum(2.0 * math.pi / n_segments * r_entry for r_entry in nearest.values()) < 1.5:
-            reached -= part
-    return reached
+    groups = groups_of(allowed, lambda c: beside[c])
+    reached = {c for group in groups if len(seeds & group) >= 8 for c in group} & land
+    behind = {
+        c
+        for c in reached
+        if any(b in reached and segment[b] == segment[c] and b <= c for _, b in fallen)
+    }
+    return reached - behind, behind
+
+
+def leads_over_edge(dr, rise):
+    """Whether a step along a segment leads down over an edge."""
+    return rise < -0.8 and rise < -0.06 * dr and dr > 2.0 * math.sqrt(2.0)
 
 
 def goes_on(candidates, a):
@@ -124,12 +169,17 @@ def around(square):
 SIDES = set(range(60))
 
 
-def fit_squares(x, y, z):
-    """Height in the middle of each square that has a plane, after three fits."""
-    squares = [
+def squares_of(x, y):
+    """Square of each place."""
+    return [
         (min(int(a // 2.0) + 30, 59), min(int(b // 2.0) + 30, 59))
         for a, b in zip(x, y, strict=True)
     ]
+
+
+def fit_squares(x, y, z):
+    """Height in the middle of each square that has a plane, after three fits."""
+    squares = squares_of(x, y)
     own = {square: np.flatnonzero([s == square for s in squares]) for square in set(squares)}
     weight = np.array([1.0 / len(own[square]) for square in squares])
     for _ in range(3):
@@ -168,7 +218,7 @@ def raised_parts(known, occupied):
 
 def fill_rings(known):
     """Give each unknown square the mean of those around it, ring by ring."""
-    while len(known) < 3600:
+    while known and len(known) < 3600:
         means = {}
         for square in itertools.product(SIDES, SIDES):
             heights = [known[other] for other in around(square) if other in known]

@@ -51,12 +51,14 @@ def heights_of(relief):
 def test_relief_is_the_reference(backend, seed, n_segments, looks_aside):
     rng = np.random.default_rng(seed)
     steep, foot, turn, noise = rng.uniform((0.1, 5.0, -3.0, 0.0), (0.8, 15.0, 3.0, 0.1))
+    fall, fall_at = rng.uniform((0.0, 4.0), (4.0, 12.0))
 
     def land(x, y):
         along = x * math.cos(turn) + y * math.sin(turn)
         bank = np.clip(steep * (along - foot), 0.0, 3.0)
         thing = 1.5 * (rng.uniform(size=len(x)) < 0.05)
-        return bank + thing + noise * rng.normal(size=len(x))
+        below = -fall * (along < -fall_at) - fall * (along < -2.5 * fall_at)
+        return bank + below + thing + noise * rng.normal(size=len(x))
 
     ranges = np.sort(rng.uniform(2.0, 65.0, 24))
     candidates = candidates_on(land, ranges, n_segments, seed, share=0.7)
@@ -92,6 +94,33 @@ def test_the_relief_is_that_of_a_bank(backend, degrees):
     far = relief.at(np.array([45.0, 500.0]), np.array([0.0, 20.0]))
     np.testing.assert_allclose(far, 3.0 * side, atol=0.1)
     assert (relief.at(np.array([-30.0, 5.0]), np.zeros(2)) == 0.0).all()
+
+
+@pytest.mark.parametrize(('at', 'depth'), [(5.0, 1.2), (7.5, 2.0), (10.0, 3.0)])
+def test_land_ends_at_an_edge_and_goes_on_below(backend, at, depth):
+    """What the edge hides is left out: on both sides the relief is that of the land to its end."""
+    candidates = candidates_on(lambda x, y: np.where(x > at, -depth, 0.0), RINGS)
+    seen = at * (HEIGHT + depth) / HEIGHT
+    candidates = candidates.where((candidates.x < at) | (candidates.x > seen))
+    _, over = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
+    is_below = candidates.x > seen
+    assert is_below.sum() > 150
+    np.testing.assert_allclose(over.z[~is_below] + HEIGHT, 0.0, atol=0.01)
+    np.testing.assert_allclose(over.z[is_below] + HEIGHT, 0.0, atol=0.05)
+
+
+def test_what_is_seen_over_a_thing_makes_no_land_of_it(backend):
+    """Of a hedge, a row of cars, the way down behind is none up; over a gap as short, none."""
+    sparse = np.array([3.0, 4.0, 5.0, 6.0, 7.0, 14.0, 15.0, 16.0, 18.0, 20.0, 24.0, 30.0])
+    lands = (
+        lambda x, y: np.where((x > 4.5) & (x < 8.0), 1.5, 0.0),
+        lambda x, y: np.where((x > 4.5) & (x < 8.0) & (np.abs(y) % 6.0 < 4.5), 1.5, 0.0),
+    )
+    for land in lands:
+        relief, _ = backend.find_relief(candidates_on(land, sparse), NO_FACES, HEIGHT, Config())
+        assert relief.is_level
+    short = candidates_on(lambda x, y: np.where(x > 7.5, -2.0, 0.0), RINGS)
+    assert backend.find_relief(short, NO_FACES, HEIGHT, Config())[0].is_level
 
 
 def test_long_steps_go_on_with_the_slope_before(backend):

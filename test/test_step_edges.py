@@ -123,6 +123,34 @@ def test_drops_are_marked_at_the_last_ring_before_them(name, at, depth, heading)
     assert np.isinf(r[np.cos(MIDDLE - heading) < 0.0]).all()
 
 
+@pytest.mark.parametrize(
+    ('name', 'at', 'depth', 'width'),
+    [
+        ('hdl-64e', 5.0, 3.0, math.inf),  # a cliff
+        ('vlp-16', 5.0, 3.0, math.inf),
+        ('os1-128', 4.5, 2.0, 9.0),  # a dike
+        ('os1-64', 3.0, 1.2, math.inf),  # a dock
+    ],
+)
+def test_ground_goes_on_up_to_an_edge_and_below_it(name, at, depth, width):
+    """And the edge is marked: it begins at ground that is seen as such."""
+    corners = [(at - width, -depth), (at - width, 0.0)] if math.isfinite(width) else []
+    terrain = polyline(0.3, [*corners, (at, 0.0), (at, -depth)])
+    scan = simulate_scan(Scene('', terrain), MOUNTED[name], np.random.default_rng(0))
+    config = Config().replace(**{'output.max_step_down': MAX_STEP_DOWN})
+    xyz = scan.points[:, :3]
+    cloud = Segmented(xyz, GroundSegmenter(config).segment(xyz), config)
+    along, is_ground = xyz[:, :2] @ [math.cos(0.3), math.sin(0.3)], cloud.is_ground
+    seen = scan.is_ground & (np.hypot(*xyz[:, :2].T) < 50.0)
+    below = seen & (along > at)
+    assert below.sum() > 500
+    assert is_ground[below].mean() > 0.97
+    assert is_ground[seen & (along < at) & (along > at - 1.0)].mean() > 0.97
+    r, distance = find_edges(*inputs_of(cloud), MAX_STEP_DOWN).r, distance_to(at, 0.3)
+    towards = distance <= 10.0
+    assert (r[towards] <= distance[towards] + 0.2).mean() >= 0.95
+
+
 def test_only_the_depth_that_is_seen_counts():
     """From 0.8 m, 0.15 m of the far wall of a trench 1.5 m wide at 8 m; 0.3 m of one of 3 m."""
     assert n_edges(trench(8.0, 1.2, 1.5), OS1_64) == 0
