@@ -107,11 +107,11 @@ def reached_on_foot(candidates, faces, height, config):
     }
     groups = groups_of(allowed, lambda c: beside[c])
     reached = {c for group in groups if len(seeds & group) >= 8 for c in group} & land
-    behind = {
-        c
-        for c in reached
-        if any(b in reached and segment[b] == segment[c] and b <= c for _, b in fallen)
-    }
+    behind = set()
+    for c in reached:
+        edges = [a for a, b in fallen if b in reached and segment[b] == segment[c] and b <= c]
+        if edges and z[c] < z[max(edges)] - 0.8:
+            behind.add(c)
     return reached - behind, behind
 
 

@@ -109,6 +109,23 @@ def test_land_ends_at_an_edge_and_goes_on_below(backend, at, depth):
     np.testing.assert_allclose(over.z[is_below] + HEIGHT, 0.0, atol=0.05)
 
 
+def test_land_across_a_ditch_is_that_before_it(backend):
+    """From there on it is as high up to its edge as the land before the ditch."""
+
+    def ditch(x, y):
+        return np.where((x > 6.0) & (x < 22.0) & (np.abs(y) < 15.0), -1.5, 0.0)
+
+    candidates = candidates_on(ditch, RINGS)
+    seen = 6.0 * (HEIGHT + 1.5) / HEIGHT
+    candidates = candidates.where((candidates.x < 6.0) | (candidates.x > seen))
+    _, over = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
+    is_below = (candidates.z < -HEIGHT - 0.5) & (np.abs(candidates.y) < 10.0)
+    is_upper = (candidates.x > 26.0) & (np.abs(candidates.y) < 10.0)
+    assert is_upper.sum() > 50 and is_below.sum() > 100
+    np.testing.assert_allclose(over.z[is_upper] + HEIGHT, 0.0, atol=0.05)
+    np.testing.assert_allclose(over.z[is_below & (candidates.x < 20.0)] + HEIGHT, 0.0, atol=0.05)
+
+
 def test_what_is_seen_over_a_thing_makes_no_land_of_it(backend):
     """Of a hedge, a row of cars, the way down behind is none up; over a gap as short, none."""
     sparse = np.array([3.0, 4.0, 5.0, 6.0, 7.0, 14.0, 15.0, 16.0, 18.0, 20.0, 24.0, 30.0])

@@ -232,12 +232,14 @@ def _reachable(
 def _sides_of(
     candidates: Candidates, reached: BoolArray, is_fallen: BoolArray
 ) -> tuple[BoolArray, BoolArray]:
-    """Candidates that are `reached`: those with no fall before them, and those behind one."""
+    """Candidates that are `reached`: those before falls, and those behind and below one."""
     offsets, before, behind = candidates.offsets, reached.copy(), np.zeros_like(reached)
     for m in range(len(offsets) - 1):
-        is_behind = False
+        edge = -np.inf
         for c in range(offsets[m], offsets[m + 1]):
-            is_behind |= reached[c] and is_fallen[c]
+            if is_fallen[c] and reached[c]:
+                edge = candidates.z[c - 1]
+            is_behind = candidates.z[c] < edge - STEEP
             before[c], behind[c] = reached[c] and not is_behind, reached[c] and is_behind
     return before, behind
 

@@ -169,7 +169,8 @@ def reachable(
     is seen over a hedge is below its top. Heights of the candidates are over the plane near the
     sensor.
 
-    Returns those with no fall before them in their segment, and those behind one, two (C,).
+    Returns those before falls in their segment, and those behind and below one, two (C,): across a
+    ditch the land is that before it.
     """
     first, second, is_fall = _steps(candidates)
     taken = allowed[first] & allowed[second]
@@ -189,8 +190,11 @@ def reachable(
     is_reached = (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
     is_fallen = np.zeros(len(allowed), dtype=np.bool_)
     is_fallen[second[taken & is_fall]] = True
-    number = np.cumsum(is_fallen & is_reached)
+    is_fallen &= is_reached
+    number = np.cumsum(is_fallen)
+    edge = np.append(0, np.flatnonzero(is_fallen))[number] - 1
     is_behind = number > np.append(0, number)[candidates.offsets][candidates.segment]
+    is_behind &= candidates.z < candidates.z[edge] - STEEP
     return is_land & is_reached & ~is_behind, is_land & is_reached & is_behind
 
 
