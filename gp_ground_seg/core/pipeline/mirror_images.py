@@ -23,8 +23,9 @@ DEEP = 0.15
 BELOW_SIGHT = 0.03
 """Depth at which a ray must pass below ground that is seen nearer [m], to tell a wet road."""
 OVER_SIGHT = 0.05
-"""Height at which it may pass over that where the road is wet [m]: of rays that meet the road side
-by side some come back from there, others from what they are mirrored to."""
+"""Height up to which a ray to an image passes over ground that is seen nearer, where the road is
+known to be wet [m]: noise. Of rays that meet the road side by side some come back from the road,
+others from what they are mirrored to."""
 NEAREST, GROUND_REACH, IMAGE_REACH = 1.0, 40.0, 60.0
 """Range from which returns may be images, up to which ground tells them, and up to which they are
 told [m]: nearer there may be the robot itself."""
@@ -51,6 +52,7 @@ class MirrorImages(NamedTuple):
         """Scan of the points `raised` without candidates that are images."""
         x, y = scan.xyz[self.points, :2].T
         candidates = scan.candidates
+        # A candidate has the place of its return; both coordinates as one number.
         is_image = np.isin(candidates.x + 1j * candidates.y, x + 1j * y)
         return scan._replace(candidates=candidates.where(~is_image))
 
