@@ -39,7 +39,7 @@ def place_of(x, y, grid):
 
 
 def lowest_of_cells(scan, config):
-    """Lowest point of each cell; of equally low ones the nearest, the first tile, then by place.
+    """Lowest point of each cell; of equally low ones the nearest, first by tile, then by place.
 
     The density is the mean over three slices of equal height of points over area.
     """
@@ -71,7 +71,7 @@ def find_faces(scan, config):
     """Tall tiles whose returns have a level normal; of those, faces down to the lowest return."""
     faces, label = config.faces, config.label
     limit, least = label.obstacle_max_height, label.obstacle_min_height + label.ground_tolerance
-    result = Faces(*np.zeros((2, len(scan.tiles.extremes)), dtype=bool))
+    result = Faces.none(scan.tiles)
     for t in np.unique(scan.tiles.tile[scan.tiles.tile >= 0]):
         own = scan.xyz[scan.tiles.tile == t].astype(np.float64)
         above = own[:, 2] - own[:, 2].min()
@@ -239,7 +239,7 @@ def label_points(scan, faces, surface, relief, config):
 
 def ground_roughness(tiles, height, counted):
     """Roughness of each tile with returns that count, by the tiles in the windows about it."""
-    side = math.isqrt(len(tiles.extremes))
+    side = math.isqrt(len(tiles.at))
     spread = {
         tile: math.sqrt(np.mean(height[counted & (tiles.tile == tile)] ** 2))
         for tile in np.unique(tiles.tile[counted])
@@ -254,13 +254,13 @@ def ground_roughness(tiles, height, counted):
 
     def about(tile, size, share, prior):
         """Level that a share of the tiles in 3 x 3 blocks of a size does not exceed."""
-        block = [place // size for place in divmod(tile, side)]
+        block = [place // size for place in divmod(int(tiles.place[tile]), side)]
         beside = [
             found
             for other, found in level.items()
             if all(
                 abs(place // size - own) <= 1
-                for place, own in zip(divmod(other, side), block, strict=True)
+                for place, own in zip(divmod(int(tiles.place[other]), side), block, strict=True)
             )
         ]
         ranked = sorted([*beside, *[median] * prior])
@@ -271,10 +271,10 @@ def ground_roughness(tiles, height, counted):
 
 def settle(scan, surface, margin, near, label):
     """Margins by the mean vote about each return near the surface."""
-    tolerance, side = label.ground_tolerance, math.isqrt(len(scan.tiles.extremes))
+    tolerance, side = label.ground_tolerance, math.isqrt(len(scan.tiles.at))
     members, obstacles = {}, set()
     for i in np.flatnonzero(near):
-        tile = divmod(int(scan.tiles.tile[i]), side)
+        tile = divmod(int(scan.tiles.place[scan.tiles.tile[i]]), side)
         over_lowest = float(scan.xyz[i, 2]) - np.nanmin(surface.mean)
         # The nearest of four layers to the tolerance; after 64 they are counted from 0 again.
         layer = math.floor(4.0 / tolerance * over_lowest + 0.5) % 64

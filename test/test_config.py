@@ -207,7 +207,7 @@ def test_what_is_removed_comes_with_what_to_use_instead(key, tmp_path, capsys):
 @pytest.mark.parametrize(
     ('changes', 'words'),
     [
-        ({'grid.r_max': 500.0, 'faces.cell_size': 0.05}, ['faces.cell_size', '32.0 GB', '2 GB']),
+        ({'grid.r_max': 500.0, 'faces.cell_size': 0.05}, ['faces.cell_size', '3.6 GB', '2 GB']),
         ({'grid.r_min': np.nextafter(50.0, 0.0), 'grid.r_max': 50.0}, ['first bin', '0.001 m']),
         ({'grid.n_bins': 1024, 'grid.bin_growth': 3.0}, ['grid.bin_growth = 3', '1.1e-07 m']),
     ],

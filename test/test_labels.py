@@ -41,7 +41,7 @@ def label(backend, ranges, z, surface=None, faces=None, angle=0.1, sigma_n=0.05,
     config = CONFIG.replace(**{'observation.sigma_n': sigma_n, **named})
     r, z = np.broadcast_arrays(np.asarray(ranges, dtype=float), np.asarray(z, dtype=float))
     scan = backend.build_grid(np.column_stack([r * np.cos(angle), r * np.sin(angle), z]), config)
-    marks = Faces(*np.zeros((2, len(scan.tiles.extremes)), dtype=bool))
+    marks = Faces.none(scan.tiles)
     for i, occluded in (faces or {}).items():
         marks.is_face[scan.tiles.tile[i]] = True
         marks.has_occluded_base[scan.tiles.tile[i]] = occluded
@@ -78,7 +78,7 @@ def labels_of(backend, points, r_max=12.0, **changes):
     knots = np.linspace(0.1 * r_max, r_max, 5)
     surface = surface_of()._replace(knots=knots)
     scan = backend.build_grid(points, config)
-    faces = Faces(*np.zeros((2, len(scan.tiles.extremes)), dtype=bool))
+    faces = Faces.none(scan.tiles)
     return backend.label_points(scan, faces, surface, LEVEL, config)
 
 

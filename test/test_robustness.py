@@ -96,7 +96,7 @@ def test_an_array_that_changes_meanwhile_does_not_crash():
 @pytest.mark.parametrize(
     'values',
     [
-        {'grid.r_max': 400, 'faces.cell_size': 0.25},
+        {'grid.r_max': 400, 'faces.cell_size': 0.125},
         pytest.param(
             {'grid.n_segments': 2048, 'grid.n_bins': 1024, 'grid.bin_growth': 1},
             marks=pytest.mark.slow,

@@ -6,6 +6,7 @@ values and `offsets`: those of segment m are ``offsets[m]:offsets[m + 1]``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import IntEnum
@@ -29,8 +30,6 @@ OUTSIDE = -1
 """Bin, cell and tile of a point that is beyond the grid."""
 NOT_FINITE = -2
 """Cell of a point that is not finite; what is no return has become so."""
-NO_TILE = 2**31 - 1
-"""Tile of the lowest point of an empty cell."""
 
 
 def as_index(places: CellArray) -> IntArray:
@@ -88,13 +87,32 @@ class PolarGrid(NamedTuple):
 
 
 class Tiles(NamedTuple):
-    """Where each point lies in a square of square tiles that holds the polar grid."""
+    """Square tiles with a point, T of them, numbered in any order.
+
+    Together with the empty ones they make a square that holds the polar grid.
+    """
 
     tile: CellArray  # (N,) tile of each point, or `OUTSIDE`
     # (T, 2) height of the lowest and of the highest point of each tile [m], in the precision of
-    # the points; infinite, minus infinite in empty ones
+    # the points
     extremes: PointArray
-    occupied: CellArray  # (K,) tiles with a point, in any order
+    place: CellArray  # (T,) place in the square, ``column * n_sides + row``
+    at: CellArray  # (n_sides^2,) tile at each place, or `OUTSIDE` where it is empty
+
+    @property
+    def n_sides(self) -> int:
+        """Tiles along a side of the square."""
+        return math.isqrt(len(self.at))
+
+    def around(self) -> CellArray:
+        """Tile at each place about each tile and its own, (T, 9); `OUTSIDE` where none is."""
+        width = self.n_sides + 2
+        padded = np.full((width, width), OUTSIDE, dtype=np.int32)
+        padded[1:-1, 1:-1] = self.at.reshape(width - 2, width - 2)
+        steps = (np.arange(3)[:, None] * width + np.arange(3)).ravel()
+        place = as_index(self.place)
+        result: CellArray = padded.ravel()[(place + 2 * (place // self.n_sides))[:, None] + steps]
+        return result
 
     @property
     def lowest_z(self) -> PointArray:
@@ -176,7 +194,7 @@ class Candidates(NamedTuple):
 class Scan(NamedTuple):
     """Points of a level frame, sorted into the polar grid and into tiles.
 
-    `xyz` and `tiles` may lie in buffers of the backend, which its next scan reuses.
+    `tiles` may lie in buffers of the backend, which its next scan reuses.
     """
 
     xyz: PointArray  # (N, 3) points [m], each coordinate contiguous (Fortran order), read-only
@@ -188,9 +206,16 @@ class Scan(NamedTuple):
 class Faces(NamedTuple):
     """Tiles that hold a vertical face: a wall, a fence, the side of a car."""
 
-    is_face: BoolArray  # (T,) whether the returns of the tile form a vertical face
-    # (T,) whether even the lowest returns belong to the face: the tile shows no ground
+    # (T + 1,) whether the returns of the tile form a vertical face; the last one, which `OUTSIDE`
+    # is the index of, is for points in no tile
+    is_face: BoolArray
+    # (T + 1,) whether even the lowest returns belong to the face: the tile shows no ground
     has_occluded_base: BoolArray
+
+    @classmethod
+    def none(cls, tiles: Tiles) -> Faces:
+        """No tile has one."""
+        return cls(*np.zeros((2, len(tiles.place) + 1), dtype=np.bool_))
 
 
 class Lines(NamedTuple):

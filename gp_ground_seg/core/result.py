@@ -237,18 +237,16 @@ class Segmentation:
         """
         return self.labelled.margin
 
-    # What follows is computed when it is first asked for: not every user asks.
-
-    @cached_property
+    @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings for the user, a line for each; logged by the segmenter."""
-        # A plain integer: comparing with an enumeration is five times slower. UNKNOWN is 0.
-        n_ground = np.count_nonzero(self.label == int(Label.GROUND))
-        n_finite = np.count_nonzero(self.label)
+        n_finite = np.count_nonzero(self.label)  # UNKNOWN is 0
         if not n_finite:
             return ()
-        is_lost = n_ground < LEAST_GROUND * n_finite
+        is_lost = np.count_nonzero(self.is_ground) < LEAST_GROUND * n_finite
         return (*self.pose.warnings, *((NO_GROUND,) if is_lost else ()))
+
+    # What follows is computed when it is first asked for: not every user asks.
 
     @cached_property
     def fit(self) -> FitReport:

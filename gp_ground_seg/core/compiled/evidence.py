@@ -1,4 +1,4 @@
-"""Compiled twin of `gp_ground_seg.core.gp.evidence`."""
+"""Compiled twin of `gp_ground_seg.core.gp.evidence`, and the stage of the surface."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.core.compiled.ground import SegmentSurfaces
+from gp_ground_seg.core.compiled.ground import SegmentSurfaces, grow_surfaces
+from gp_ground_seg.core.compiled.latent import latent_log_length_scales
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame
 from gp_ground_seg.core.gp.evidence import (
+    CLEARLY,
     ODDS,
+    STEP,
     combined_surface,
     is_low_and_near,
     is_on_object,
@@ -18,11 +21,53 @@ from gp_ground_seg.core.gp.evidence import (
 )
 from gp_ground_seg.core.gp.kernels import prior_variance
 from gp_ground_seg.core.jit import jit
-from gp_ground_seg.core.parameters.config import GrowthConfig
+from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
 
 
 @jit(entry=True)
-def find_seeds(
+def estimate_surface(
+    frame: Frame,
+    theta: FloatArray,
+    observation: ObservationConfig,
+    growth: GrowthConfig,
+    is_latent: bool,
+    looks_aside: bool,
+    by_roughness: bool,
+    evidence: FloatArray,
+    by_itself: SegmentSurfaces,
+    mean: FloatArray,
+    std: FloatArray,
+) -> None:
+    """Do what `gp_ground_seg.core.gp.ground.estimate_surface` does, into the last three.
+
+    `is_latent` and `by_roughness` are the model of the length-scale and the rule of the labels by
+    the parameters, `looks_aside` is `uses_neighbours_in`. `evidence` (2, 2, M, K) has arbitrary
+    content.
+    """
+    slope_std, knots = observation.slope_std, frame.knots
+    own, table, nothing = evidence[0], evidence[1], np.empty((2, 0, 0))
+    if is_latent:
+        u, knot_u = by_itself.log_length_scale, by_itself.knot_log_length_scale
+        latent_log_length_scales(frame, theta, 1, u, knot_u)
+    max_slope = CLEARLY * slope_std if looks_aside else -1.0
+    odds = _find_seeds(frame, theta, growth, max_slope, own[0], by_itself.seed)
+    odds = odds if by_roughness else 0.0
+    from_neighbours = nothing
+    # Variables, as numba compiles a function anew for each constant that it is called with.
+    some, every = STEP, 1
+    if looks_aside:
+        by_itself.mean[:], by_itself.std[:] = math.nan, math.nan
+        grow_surfaces(frame, theta, observation, growth, odds, nothing, some, by_itself)
+        _find_evidence(by_itself, theta, knots, slope_std, own, table)
+        from_neighbours = table
+    grow_surfaces(frame, theta, observation, growth, odds, from_neighbours, every, by_itself)
+    if looks_aside:
+        _find_evidence(by_itself, theta, knots, slope_std, own, table)
+    _combine(by_itself, from_neighbours, theta, knots, slope_std, frame.prior_mean, mean, std)
+
+
+@jit()
+def _find_seeds(
     frame: Frame,
     theta: FloatArray,
     growth: GrowthConfig,
@@ -94,10 +139,9 @@ def rise_along(table: FloatArray, n_bins: int, max_slope: float, knots: FloatArr
             row[j] = min(row[j], row[j + 1] + max_slope * (knots[j + 1] - knots[j]))
 
 
-@jit(entry=True)
-def find_evidence(
-    mean: FloatArray,
-    std: FloatArray,
+@jit()
+def _find_evidence(
+    by_itself: SegmentSurfaces,
     theta: FloatArray,
     knots: FloatArray,
     slope_std: float,
@@ -110,7 +154,7 @@ def find_evidence(
 
     `own_evidence` (2, M, K) is overwritten.
     """
-    n_segments, n_knots = mean.shape
+    n_segments, n_knots = by_itself.mean.shape
     # Unsigned, as a signed index could count from the end.
     start, end = np.uintp(0), np.uintp(n_knots)
     nearest, nearest_std, rise = np.empty(n_knots), np.empty(n_knots), np.empty(n_knots)
@@ -118,7 +162,8 @@ def find_evidence(
         rise[j] = slope_std * 2.0 * math.pi / n_segments * knots[j]
     sill = math.exp(theta[0]) ** 2
     for m in range(n_segments):
-        mean_m, std_m, height, deviation = mean[m], std[m], own_evidence[0, m], own_evidence[1, m]
+        mean_m, std_m = by_itself.mean[m], by_itself.std[m]
+        height, deviation = own_evidence[0, m], own_evidence[1, m]
         for j in range(start, end):
             prior = prior_variance(sill, slope_std, knots[j])
             height[j], deviation[j] = shown_by(mean_m[j], std_m[j], prior)
@@ -147,8 +192,8 @@ def find_evidence(
             weighted[j] /= total[j] if total[j] > 0.0 else 1.0
 
 
-@jit(entry=True)
-def combine(
+@jit()
+def _combine(
     by_itself: SegmentSurfaces,
     from_neighbours: FloatArray,
     theta: FloatArray,

@@ -96,7 +96,7 @@ class _Columns(NamedTuple):
     whitened: FloatArray
 
 
-@jit(entry=True)
+@jit()
 def grow_surfaces(
     frame: Frame,
     theta: FloatArray,

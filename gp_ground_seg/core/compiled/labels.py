@@ -1,18 +1,16 @@
-"""Compiled twin of `gp_ground_seg.core.pipeline.labels`, in four calls.
+"""Compiled twin of `gp_ground_seg.core.pipeline.labels`.
 
-`fit_pieces` prepares the surface of each cell, `survey` measures the heights of the points over
-it, `label_by_bands` labels the points by the roughness of the ground (see
-`gp_ground_seg.core.compiled.roughness`), and `vote` changes labels near obstacles by votes.
+Tables of tiles have one row more, for points in no tile.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.core.compiled.relief import find_places
+from gp_ground_seg.core.compiled.roughness import set_roughness
 from gp_ground_seg.core.frame import (
     NOT_FINITE,
     BoolArray,
@@ -52,22 +50,65 @@ VOTER_FLAG = 2**38
 
 
 @jit(entry=True)
-def fit_pieces(surface: GroundSurface, pieces: FloatArray) -> None:
+def label_points(
+    scan: Scan,
+    faces: Faces,
+    surface: GroundSurface,
+    relief: Relief,
+    is_level: bool,
+    config: LabelConfig,
+    depth: float,
+    units: float,
+    by_roughness: bool,
+    result: Labelled,
+) -> None:
+    """Height, label and margin of each point, into `result`.
+
+    `is_level` says whether the relief is level; `depth` and `units` are those of `depth_of_ground`
+    and `sum_units`, and `by_roughness` is the rule of the parameters.
+    """
+    tiles, n_tiles = scan.tiles, len(scan.tiles.place)
+    sums, bands = np.zeros((n_tiles + 1, 2), np.int64), np.zeros(n_tiles + 1)
+    has_obstacle = np.zeros(n_tiles + 1, np.bool_)
+    pieces = _fit_pieces(surface)
+    _survey(scan, faces.is_face, pieces, relief, is_level, units, result.height, sums)
+    if by_roughness:
+        set_roughness(tiles, sums, units, bands)
+    for t in range(n_tiles + 1):
+        bands[t] = ground_band(bands[t], config)
+    _label_by_bands(scan, faces, config, depth, bands, has_obstacle, result)
+    if by_roughness:
+        _vote(scan, _lowest_of(surface), has_obstacle, config, result)
+
+
+@jit()
+def _lowest_of(surface: GroundSurface) -> float:
+    """Lowest height of the surface [m], from which layers of votes are counted."""
+    lowest = math.nan
+    for height in surface.mean.reshape(-1):
+        lowest = lowest if height >= lowest or math.isnan(height) else height
+    return lowest
+
+
+@jit()
+def _fit_pieces(surface: GroundSurface) -> FloatArray:
     """Line of the surface across each cell, level and slope over range, (M * n_bins + 1, 2).
 
     The last row is for points in no cell, and NaN.
     """
     knots, mean = surface.knots, surface.mean
     n_bins = len(knots) - 1
+    pieces = np.empty((len(mean) * n_bins + 1, 2))
     for m in range(len(mean)):
         for n in range(n_bins):
             piece = line_between(knots[n], knots[n + 1], mean[m, n], mean[m, n + 1])
             pieces[m * n_bins + n, 0], pieces[m * n_bins + n, 1] = piece
     pieces[len(pieces) - 1, 0] = pieces[len(pieces) - 1, 1] = math.nan
+    return pieces
 
 
-@jit(entry=True)
-def survey(
+@jit()
+def _survey(
     scan: Scan,
     is_face: BoolArray,
     pieces: FloatArray,
@@ -79,10 +120,8 @@ def survey(
 ) -> None:
     """Heights of the points over the surface, and the sums for the roughness of tiles.
 
-    For `pieces` see `fit_pieces`, for `sums` `gp_ground_seg.core.compiled.roughness`.
+    For `pieces` see `_fit_pieces`, for `sums` `gp_ground_seg.core.compiled.roughness`.
     """
-    for occupied in scan.tiles.occupied:
-        sums[np.uintp(occupied), 0] = sums[np.uintp(occupied), 1] = 0
     x, y, tile = scan.xyz.T[0], scan.xyz.T[1], scan.tiles.tile
     land = relief.pieces.reshape(-1, 4)
     u, v, piece = np.zeros(BLOCK), np.zeros(BLOCK), np.zeros(BLOCK, np.int32)
@@ -128,27 +167,8 @@ def _add_squares(
             sums[t, 1] += int(whole_units(height[i] * height[i], units))
 
 
-class VoteBuffers(NamedTuple):
-    """Working arrays of the votes, see `gp_ground_seg.core.pipeline.labels.mean_votes`.
-
-    Attributes
-    ----------
-    rows : (T + 1,) int32
-        Row of each tile in the table of votes, 0 if none is about it; the last one is for points
-        in no tile.
-    voters : (N,) int32
-        Points in tiles with an obstacle; there are fewer.
-    places : (N,) int32
-        Layer of each of them, counted over all rows.
-    """
-
-    rows: CellArray
-    voters: CellArray
-    places: CellArray
-
-
-@jit(entry=True)
-def label_by_bands(
+@jit()
+def _label_by_bands(
     scan: Scan,
     faces: Faces,
     config: LabelConfig,
@@ -159,49 +179,48 @@ def label_by_bands(
 ) -> None:
     """Label the points from their heights in `result`, and find tiles of obstacles.
 
-    Ground reaches `depth` below the surface. `has_obstacle` (T,) becomes true where a return near
-    the surface is no ground. `bands` (T + 1,) is the roughness of the ground in each tile [m], and
-    becomes the largest height of ground there; the last one is for points in no tile.
+    Ground reaches `depth` below the surface, and `bands` (T + 1,) above it [m]. `has_obstacle`
+    becomes true where a return near the surface is no ground.
     """
-    for occupied in scan.tiles.occupied:
-        bands[np.uintp(occupied)] = ground_band(bands[np.uintp(occupied)], config)
     z, tile, cell = scan.xyz.T[2], scan.tiles.tile, scan.grid.cell
     is_face, is_occluded, extremes = faces.is_face, faces.has_occluded_base, scan.tiles.extremes
     height, label, margins = result.height, result.label, result.margin
-    for i in range(len(cell)):
-        n, h = cell[i], height[i]
-        t = np.uintp(tile[i] if n >= 0 else len(bands) - 1)
-        margin = band_margin(h, bands[t], depth)
-        if n >= 0 and is_face[t]:
+    for i in range(len(tile)):
+        t = np.uintp(tile[i] if tile[i] >= 0 else len(bands) - 1)
+        margin = band_margin(height[i], bands[t], depth)
+        if is_face[t]:
             over_lowest = np.float64(z[i]) - np.float64(extremes[t, 0])
             margin = face_margin(margin, over_lowest, is_occluded[t], config.ground_tolerance)
         margins[i] = margin
-        otherwise = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
-        label[i] = _GROUND if margin >= 0.0 else otherwise
-        if margin < 0.0 and is_near(h):
+        if margin < 0.0 and is_near(height[i]):
             has_obstacle[t] = True
+    # By itself, as it has no branch.
+    for i in range(len(cell)):
+        otherwise = _UNKNOWN if cell[i] == NOT_FINITE else _OBSTACLE
+        label[i] = _GROUND if margins[i] >= 0.0 else otherwise
 
 
-@jit(entry=True)
-def vote(
+@jit()
+def _vote(
     scan: Scan,
     lowest: float,
     has_obstacle: BoolArray,
     config: LabelConfig,
-    buffers: VoteBuffers,
     result: Labelled,
 ) -> None:
     """Change margins and labels of the returns near an obstacle by the mean votes about them.
 
     `lowest` is that of `lowest_of` [m].
     """
-    obstacle_tiles, n_rows = _number_tiles(scan.tiles, has_obstacle, buffers.rows)
+    obstacle_tiles, rows, n_rows = _number_tiles(scan.tiles, has_obstacle)
     votes = np.zeros((n_rows, N_LAYERS), np.int64)
-    n_voters = _vote(scan, lowest, len(obstacle_tiles), config, result, buffers, votes.reshape(-1))
-    sums = _sum_around(obstacle_tiles, scan.tiles, buffers.rows, votes)
+    voters, places = _count_votes(
+        scan, lowest, rows, len(obstacle_tiles), config, result, votes.reshape(-1)
+    )
+    sums = _sum_around(obstacle_tiles, scan.tiles, rows, votes)
     margins, unit = result.margin, config.ground_tolerance / VOTE_UNITS
-    for n in range(n_voters):
-        i, place = np.uintp(buffers.voters[n]), buffers.places[n]
+    for n in range(len(voters)):
+        i, place = np.uintp(voters[n]), places[n]
         layer, total = place % N_LAYERS, 0
         for step in range(N_LAYERS - 1, N_LAYERS + 2):
             total += sums[np.uintp(place - layer + (layer + step) % N_LAYERS)]
@@ -212,44 +231,49 @@ def vote(
 
 
 @jit(part=True)
-def _number_tiles(tiles: Tiles, has_obstacle: BoolArray, rows: CellArray) -> tuple[CellArray, int]:
-    """Give rows to tiles with an obstacle, from 1 on, then to those around.
+def _number_tiles(tiles: Tiles, has_obstacle: BoolArray) -> tuple[CellArray, CellArray, int]:
+    """Give rows in the table of votes to tiles with an obstacle, from 1 on, then to those around.
 
-    Returns the tiles of the first rows, and the number of all. Row 0 is for the other tiles, and
-    gets no votes.
+    Returns the tiles of the first rows, the row of each tile, (T + 1,), and the number of rows.
+    Row 0 is for the other tiles, and gets no votes.
     """
-    n_sides, n_rows = int(math.sqrt(len(has_obstacle))), 1
-    obstacle_tiles = np.empty(len(tiles.occupied) + 1, np.int32)
-    rows[:] = 0
-    for tile in tiles.occupied:
-        if has_obstacle[np.uintp(tile)]:
-            obstacle_tiles[n_rows], rows[np.uintp(tile)] = tile, n_rows
+    at, n_tiles, n_rows = tiles.at, len(tiles.place), 1
+    n_sides = int(math.sqrt(len(at)))
+    obstacle_tiles, rows = np.empty(n_tiles + 1, np.int32), np.zeros(n_tiles + 1, np.int32)
+    for t in range(n_tiles):
+        if has_obstacle[t]:
+            obstacle_tiles[n_rows], rows[t] = t, n_rows
             n_rows += 1
     obstacle_tiles = obstacle_tiles[:n_rows]
-    for tile in obstacle_tiles[1:]:
-        column, row = tile // n_sides, tile % n_sides
+    for t in obstacle_tiles[1:]:
+        place = tiles.place[np.uintp(t)]
+        column, row = place // n_sides, place % n_sides
         for x in range(max(column - 1, 0), min(column + 2, n_sides)):
             for y in range(max(row - 1, 0), min(row + 2, n_sides)):
-                t = np.uintp(x * n_sides + y)
-                if rows[t] == 0 and tiles.extremes[t, 0] < math.inf:
-                    rows[t] = n_rows
+                beside = at[np.uintp(x * n_sides + y)]
+                if beside >= 0 and rows[np.uintp(beside)] == 0:
+                    rows[np.uintp(beside)] = n_rows
                     n_rows += 1
-    return obstacle_tiles, n_rows
+    return obstacle_tiles, rows, n_rows
 
 
 @jit(part=True)
-def _vote(
+def _count_votes(
     scan: Scan,
     lowest: float,
+    rows: CellArray,
     n_obstacle_tiles: int,
     config: LabelConfig,
     result: Labelled,
-    buffers: VoteBuffers,
     votes: IntArray,
-) -> int:
-    """Add up the votes in each layer, whole numbers; return how many are in obstacle tiles."""
-    tolerance, rows, n = config.ground_tolerance, buffers.rows, 0
+) -> tuple[CellArray, CellArray]:
+    """Add up the votes in each layer, whole numbers.
+
+    Returns the voters in tiles with an obstacle, and the place of the layer of each in `votes`.
+    """
+    tolerance, n = config.ground_tolerance, 0
     z, tile = scan.xyz.T[2], scan.tiles.tile
+    voters, places = np.empty(len(tile), np.int32), np.empty(len(tile), np.int32)
     for i in range(len(tile)):
         row = rows[np.uintp(tile[i] if tile[i] >= 0 else len(rows) - 1)]
         if row > 0 and is_near(result.height[i]):
@@ -258,9 +282,9 @@ def _vote(
             vote = vote_of(result.margin[i], tolerance)
             votes[np.uintp(place)] += VOTER_FLAG + int(vote + VOTE_UNITS)
             if row < n_obstacle_tiles:
-                buffers.voters[n], buffers.places[n] = i, place
+                voters[n], places[n] = i, place
                 n += 1
-    return n
+    return voters[:n], places[:n]
 
 
 @jit(part=True)
@@ -268,14 +292,16 @@ def _sum_around(
     obstacle_tiles: CellArray, tiles: Tiles, rows: CellArray, votes: IntArray
 ) -> IntArray:
     """Sum the votes of each tile with an obstacle and the eight around it, layer by layer."""
-    n_sides, sums = int(math.sqrt(len(rows))), np.zeros((len(obstacle_tiles), N_LAYERS), np.int64)
+    at, sums = tiles.at, np.zeros((len(obstacle_tiles), N_LAYERS), np.int64)
+    n_sides = int(math.sqrt(len(at)))
     for k in range(1, len(obstacle_tiles)):
-        column, row, about = obstacle_tiles[k] // n_sides, obstacle_tiles[k] % n_sides, sums[k]
+        place, about = tiles.place[np.uintp(obstacle_tiles[k])], sums[k]
+        column, row = place // n_sides, place % n_sides
         for x in range(max(column - 1, 0), min(column + 2, n_sides)):
             for y in range(max(row - 1, 0), min(row + 2, n_sides)):
-                k_beside = rows[np.uintp(x * n_sides + y)]
-                if k_beside > 0:
-                    beside = votes[np.uintp(k_beside)]
+                t = at[np.uintp(x * n_sides + y)]
+                if t >= 0:
+                    beside = votes[np.uintp(rows[np.uintp(t)])]
                     for layer in range(N_LAYERS):
                         about[layer] += beside[layer]
     return sums.reshape(-1)

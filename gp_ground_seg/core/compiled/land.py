@@ -242,6 +242,10 @@ def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, walk: _W
             across, gap = aside * arc_of(r[c], n_segments), 0.5 * largest_gap(r[c])
             for there in range(max(behind - 1, first), min(behind + 1, stop)):
                 dr = abs(r[there] - r[c])
+                # Most are joined already; of raised ones it also matters what leads to them.
+                is_done = walk.parent[c] == walk.parent[there]
+                if is_done and not (walk.is_raised[c] or walk.is_raised[there]):
+                    continue
                 if allowed[there] and dr <= gap:
                     distance = math.sqrt(dr * dr + across * across)
                     if can_step(distance, z[there] - z[c], GENTLE):

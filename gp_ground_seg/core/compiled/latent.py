@@ -13,7 +13,7 @@ from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.core.jit import jit
 
 
-@jit(entry=True)
+@jit()
 def latent_log_length_scales(
     frame: Frame, theta: FloatArray, step: int, at_candidates: FloatArray, at_knots: FloatArray
 ) -> None:

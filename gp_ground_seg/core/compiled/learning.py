@@ -37,7 +37,6 @@ def learn_frame(
     is_latent: bool,
     odds: float,
     by_itself: SegmentSurfaces,
-    search: Search,
     theta: FloatArray,
     outcome: FloatArray,
 ) -> int:
@@ -53,6 +52,17 @@ def learn_frame(
     for i in range(2, len(theta)):
         has_latent |= space.free[i]
     outcome[0], outcome[1] = -math.inf, BUDGET
+    d, places = len(theta), np.empty((6, len(theta)))
+    search = Search(
+        places[0],
+        places[1],
+        places[2],
+        places[3],
+        places[4],
+        places[5],
+        np.empty((d, d)),
+        np.empty(2),
+    )
     n_rounds = n_before = n_evaluations = 0
     budget = max(learning.max_evaluations // 2, 1)
     while budget > 0:

@@ -1,7 +1,4 @@
-"""Compiled twin of `gp_ground_seg.core.pipeline.polar_grid`.
-
-`sort_points` fills tables of the cells and of the tiles, `take_candidates` takes the candidates.
-"""
+"""Compiled twin of `gp_ground_seg.core.pipeline.polar_grid`."""
 
 from __future__ import annotations
 
@@ -12,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.frame import (
-    NO_TILE,
     NOT_FINITE,
     OUTSIDE,
     Candidates,
     CellArray,
     FloatArray,
+    IntArray,
     PointArray,
 )
 from gp_ground_seg.core.jit import jit
@@ -49,27 +46,35 @@ class CellTable(NamedTuple):
 
 
 class TileTable(NamedTuple):
-    """Extremes of the points of each tile.
+    """The arrays of `Tiles`, with room for more tiles.
 
     Attributes
     ----------
-    extremes : (T + 1, 2) float32 or float64
-        Height of the lowest and the highest point [m]; infinite, minus infinite in empty
-        tiles. The last row is for points in no tile.
-    occupied : (T + 2,) int32
-        Number of tiles with a point, then these tiles. Code that fills the table first empties
-        those, a tenth of all.
+    extremes : (capacity, 2) float32 or float64
+        Heights of the lowest and the highest point of each tile [m].
+    place : (capacity,) int32
+        Place of each tile.
+    at : (n_sides^2,) int32
+        Tile at each place, or `OUTSIDE`.
+    number : (1,) int64
+        How many tiles there are. Code that fills the table first empties their places, a tenth
+        of all.
     """
 
     extremes: PointArray
-    occupied: CellArray
+    place: CellArray
+    at: CellArray
+    number: IntArray
 
     @classmethod
-    def empty(cls, n_tiles: int, dtype: npt.DTypeLike) -> TileTable:
-        """Table without a point."""
-        extremes = np.empty((n_tiles + 1, 2), dtype=dtype)
-        extremes[:, 0], extremes[:, 1] = np.inf, -np.inf
-        return cls(extremes, np.zeros(n_tiles + 2, dtype=np.int32))
+    def empty(cls, n_places: int, capacity: int, dtype: npt.DTypeLike) -> TileTable:
+        """Table without a tile."""
+        return cls(
+            np.empty((capacity, 2), dtype=dtype),
+            np.empty(capacity, np.int32),
+            np.full(n_places, OUTSIDE, np.int32),
+            np.zeros(1, np.int64),
+        )
 
 
 class Places(NamedTuple):
@@ -81,50 +86,49 @@ class Places(NamedTuple):
 
 
 @jit(entry=True)
-def sort_points(
+def build_grid(
     columns: PointArray,
     geometry: GridGeometry,
+    min_extent: float,
     places: Places,
     cells: CellTable,
     tiles: TileTable,
-) -> None:
+    candidates: Candidates,
+) -> int:
     """Sort points, (3, N), into cells and tiles, with the extremes of each.
 
     Block by block: first the places of the points, in loops without branches; then the
-    extremes.
+    extremes. Returns the number of candidates, see `_take_candidates`.
     """
     cell, r, tile = places.cell, places.r, places.tile
     extremes, numbers = cells.extremes, cells.numbers
-    _clear(extremes, numbers, tiles.extremes, tiles.occupied)
-    range_entry = np.empty(BLOCK, np.int32)
+    _clear(extremes, numbers, tiles)
+    range_entry, place = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
     key, key_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, np.int32)
     for first in range(0, len(r), BLOCK):
         block = slice(first, min(first + BLOCK, len(r)))
         x, y, z = columns[0, block], columns[1, block], columns[2, block]
         _compute_range(x, y, z, geometry.ranges, r[block], range_entry, cell[block])
-        _compute_azimuth_key(x, y, geometry, cell[block], key, key_entry, tile[block])
+        _compute_azimuth_key(x, y, geometry, cell[block], key, key_entry, place)
         _look_up(geometry, r[block], range_entry, key, key_entry, cell[block])
-        _widen(z, cell[block], tile[block], extremes, numbers, tiles.extremes, tiles.occupied)
+        _widen(z, cell[block], place, tile[block], extremes, numbers, tiles)
     for first in range(0, len(r), BLOCK):
         block = slice(first, min(first + BLOCK, len(r)))
-        _resolve_lowest(columns[:, block], r[block], cell[block], tile[block], extremes, numbers)
+        own = columns[:, block], r[block], cell[block], tile[block]
+        _resolve_lowest(*own, tiles.place, extremes, numbers)
+    return _take_candidates(cells, geometry.edges, min_extent, candidates)
 
 
 @jit(part=True)
-def _clear(
-    extremes: PointArray, numbers: CellArray, tile_extremes: PointArray, occupied: CellArray
-) -> None:
-    """Make the tables those of no points; of the tiles only those that were occupied."""
+def _clear(extremes: PointArray, numbers: CellArray, tiles: TileTable) -> None:
+    """Make the tables those of no points."""
     for k in range(len(numbers)):
         extremes[k, 0] = extremes[k, 1] = np.inf
         extremes[k, 2] = -np.inf
-        numbers[k, 0], numbers[k, 1] = 0, NO_TILE
-    for place in range(1, occupied[0] + 1):
-        k = np.uintp(occupied[place])
-        tile_extremes[k, 0], tile_extremes[k, 1] = np.inf, -np.inf
-    last = len(tile_extremes) - 1
-    tile_extremes[last, 0], tile_extremes[last, 1] = np.inf, -np.inf
-    occupied[0] = 0
+        numbers[k, 0], numbers[k, 1] = 0, OUTSIDE
+    for t in range(tiles.number[0]):
+        tiles.at[np.uintp(tiles.place[t])] = OUTSIDE
+    tiles.number[0] = 0
 
 
 @jit()
@@ -160,9 +164,9 @@ def _compute_azimuth_key(
     cell: CellArray,
     key: PointArray,
     entry: CellArray,
-    tile: CellArray,
+    place: CellArray,
 ) -> None:
-    """Azimuth key of each point that has a cell, its entry in the table, and the tile."""
+    """Azimuth key of each point that has a cell, its entry in the table, and place of its tile."""
     number = x.dtype.type
     zero, four = number(0.0), number(4.0)
     half, per_metre = number(geometry.ranges.edges[-1]), number(geometry.tiles_per_metre)
@@ -179,7 +183,7 @@ def _compute_azimuth_key(
         entry[i] = np.int32(key_i * per_key)
         column = np.int32(min((x_i + half) * per_metre, last))
         row = np.int32(min((y_i + half) * per_metre, last))
-        tile[i] = column * n_sides + row if inside else OUTSIDE
+        place[i] = column * n_sides + row if inside else OUTSIDE
 
 
 @jit()
@@ -206,31 +210,38 @@ def _look_up(
 def _widen(
     z: PointArray,
     cell: CellArray,
+    place: CellArray,
     tile: CellArray,
     extremes: PointArray,
     numbers: CellArray,
-    tile_extremes: PointArray,
-    occupied: CellArray,
+    tiles: TileTable,
 ) -> None:
-    """Heights and number of the points of each cell and tile, without a branch.
+    """Heights and number of the points of each cell and tile; tile of each point.
 
-    Lists the tiles that become occupied.
+    Numbers the tiles in the order of their first points.
     """
-    n_occupied = occupied[0]
+    tile_extremes, at, n_tiles = tiles.extremes, tiles.at, tiles.number[0]
     for i in range(len(z)):
         k = np.uintp(cell[i] if cell[i] >= 0 else len(numbers) - 1)
         low, high = extremes[k, 0], extremes[k, 2]
         extremes[k, 0] = z[i] if z[i] < low else low
         extremes[k, 2] = z[i] if z[i] > high else high
         numbers[k, 0] += np.int32(1)
-        k = np.uintp(tile[i] if tile[i] >= 0 else len(tile_extremes) - 1)
+        if place[i] < 0:
+            tile[i] = OUTSIDE
+            continue
+        t = at[np.uintp(place[i])]
+        if t < 0:
+            t = np.int32(n_tiles)
+            at[np.uintp(place[i])], tiles.place[t] = t, place[i]
+            tile_extremes[t, 0], tile_extremes[t, 1] = np.inf, -np.inf
+            n_tiles += 1
+        tile[i] = t
+        k = np.uintp(t)
         low, high = tile_extremes[k, 0], tile_extremes[k, 1]
-        # Written in any case, counted only where the tile was empty.
-        occupied[np.uintp(n_occupied + 1)] = tile[i]
-        n_occupied += np.int32((low > high) & (tile[i] >= 0))
         tile_extremes[k, 0] = z[i] if z[i] < low else low
         tile_extremes[k, 1] = z[i] if z[i] > high else high
-    occupied[0] = n_occupied
+    tiles.number[0] = n_tiles
 
 
 @jit()
@@ -239,6 +250,7 @@ def _resolve_lowest(
     r: PointArray,
     cell: CellArray,
     tile: CellArray,
+    tile_places: CellArray,
     extremes: PointArray,
     numbers: CellArray,
 ) -> None:
@@ -259,7 +271,7 @@ def _resolve_lowest(
         r_i, nearest = r[i], extremes[k, 1]
         is_first = r_i < nearest
         if r_i == nearest:
-            is_first = tile[i] < numbers[k, 1]
+            is_first = tile_places[tile[i]] < tile_places[numbers[k, 1]]
             if tile[i] == numbers[k, 1]:
                 is_first = x[i] < extremes[k, 3]
                 is_first |= x[i] == extremes[k, 3] and y[i] < extremes[k, 4]
@@ -268,8 +280,8 @@ def _resolve_lowest(
             extremes[k, 3], extremes[k, 4] = x[i], y[i]
 
 
-@jit(entry=True)
-def take_candidates(
+@jit()
+def _take_candidates(
     cells: CellTable, edges: FloatArray, min_extent: float, candidates: Candidates
 ) -> int:
     """Take the lowest point of each cell, into arrays with room for all cells.

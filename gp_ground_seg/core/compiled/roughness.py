@@ -29,59 +29,52 @@ N_WORDS = N_LEVELS // 8
 _ONES, _LOWEST_BYTE = np.uint64(0x0101010101010101), np.uint64(255)
 
 
-@jit(entry=True)
+@jit()
 def set_roughness(
     tiles: Tiles,
     sums: IntArray,
     units: float,
-    block_to_row: CellArray,
-    counts: WordArray,
     roughness: FloatArray,
 ) -> None:
-    """Roughness of the ground in each occupied tile, into `roughness` (T + 1,) [m].
+    """Roughness of the ground in each tile, into `roughness` (T + 1,), zeros before [m].
 
     Parameters
     ----------
     tiles : Tiles
         Tiles of the points.
     sums : (T + 1, 2) int64
-        For each occupied tile the number of returns near the surface and the sum of their squared
-        heights; the last row is for points in no tile.
+        For each tile the number of returns near the surface and the sum of their squared heights;
+        the last row is for points in no tile.
     units : float
         Whole units of squared heights for 1 m^2.
-    block_to_row, counts : ((sqrt(T) + 2)^2,) int32, (N_WORDS * (K + 1),) uint64
-        Working arrays with arbitrary content; K tiles are occupied.
     roughness : (T + 1,) float64
-        Of the occupied tiles the roughness, 0 where no return is near the surface; the last one,
-        for points in no tile, is NaN.
+        Stays as it is where no return is near the surface, and for points in no tile.
     """
-    # Of the occupied tiles in their order: those of all tiles would lie far apart in memory.
-    known, level, of_frame = _known_levels(tiles, sums, units)
-    n_sides = int(math.sqrt(len(roughness) - 1))
-    near = _levels_about(known, level, n_sides, NEAR, of_frame, block_to_row, counts)
-    wide = _levels_about(known, level, n_sides, WIDE, of_frame, block_to_row, counts)
-    for tile in tiles.occupied:
-        roughness[np.uintp(tile)] = 0.0
+    known, level, of_frame = _known_levels(sums, units)
+    n_sides, place = int(math.sqrt(len(tiles.at))), np.empty(len(known), np.int32)
+    for k in range(len(known)):
+        place[k] = tiles.place[np.uintp(known[k])]
+    near = _levels_about(place, level, n_sides, NEAR, of_frame)
+    wide = _levels_about(place, level, n_sides, WIDE, of_frame)
     for k in range(len(known)):
         most = MOST_OVER_WIDE * ROUGHNESS[np.uintp(wide[k])]
         roughness[np.uintp(known[k])] = min(ROUGHNESS[np.uintp(near[k])], most)
-    roughness[len(roughness) - 1] = math.nan
 
 
 @jit()
-def _known_levels(tiles: Tiles, sums: IntArray, units: float) -> tuple[CellArray, CellArray, int]:
+def _known_levels(sums: IntArray, units: float) -> tuple[CellArray, CellArray, int]:
     """Tiles with a return near the surface, the level of each (K,), and the median of these."""
     counts, n_known = np.zeros(N_LEVELS, np.int64), 0
-    n = len(tiles.occupied)
-    known, level = np.empty(n, np.int32), np.empty(n, np.int32)
-    for tile in tiles.occupied:
-        number = sums[np.uintp(tile), 0]
+    n_tiles = len(sums) - 1
+    known, level = np.empty(n_tiles, np.int32), np.empty(n_tiles, np.int32)
+    for t in range(n_tiles):
+        number = sums[t, 0]
         if number > 0:
-            square = np.float64(sums[np.uintp(tile), 1]) / (units * np.float64(number))
+            square = np.float64(sums[t, 1]) / (units * np.float64(number))
             found = 0
             for k in range(len(SQUARE_EDGES)):
                 found += np.int64(square >= SQUARE_EDGES[k])
-            known[n_known], level[n_known] = tile, found
+            known[n_known], level[n_known] = t, found
             counts[found] += 1
             n_known += 1
     return known[:n_known], level[:n_known], _level_at(counts, n_known, 0.5)
@@ -89,24 +82,17 @@ def _known_levels(tiles: Tiles, sums: IntArray, units: float) -> tuple[CellArray
 
 @jit()
 def _levels_about(
-    tile: CellArray,
-    level: CellArray,
-    n_sides: int,
-    window: Window,
-    of_frame: int,
-    block_to_row: CellArray,
-    counts: WordArray,
+    place: CellArray, level: CellArray, n_sides: int, window: Window, of_frame: int
 ) -> CellArray:
-    """Level in the window about each of the tiles (K,) of known `level`, (K,)."""
+    """Level in the window about the tiles at each `place` (K,), of known `level`, (K,)."""
     shift, n_rows = window.shift, 1
     # Blocks in a square with one more at each side, so that each has eight around it.
     width = (n_sides - 1 >> shift) + 3
-    for block in range(width * width):
-        block_to_row[block] = 0
-    own, row_to_block = np.empty(len(tile) + 1, np.int32), np.empty(len(tile) + 1, np.int32)
-    for k in range(len(tile)):
-        column = tile[k] // n_sides
-        row = tile[k] - column * n_sides
+    block_to_row = np.zeros(width * width, np.int32)
+    own, row_to_block = np.empty(len(place) + 1, np.int32), np.empty(len(place) + 1, np.int32)
+    for k in range(len(place)):
+        column = place[k] // n_sides
+        row = place[k] - column * n_sides
         block = np.uintp(((column >> shift) + 1) * width + (row >> shift) + 1)
         if block_to_row[block] == 0:
             block_to_row[block], row_to_block[n_rows] = n_rows, block
@@ -114,9 +100,8 @@ def _levels_about(
         own[k] = block_to_row[block]
     # Row 0 is that of blocks without such a tile. One dimension, as views of rows take longer than
     # the sums.
-    for w in range(n_rows * N_WORDS):
-        counts[w] = 0
-    for k in range(len(tile)):
+    counts = np.zeros(n_rows * N_WORDS, np.uint64)
+    for k in range(len(place)):
         counts[np.uintp(own[k] * N_WORDS + level[k] // 8)] += _byte(1, level[k])
     about, level_of_row = np.empty(N_WORDS, np.uint64), np.empty(n_rows, np.int32)
     for n in range(1, n_rows):
@@ -129,7 +114,7 @@ def _levels_about(
                 for w in range(N_WORDS):
                     about[w] += counts[np.uintp(first + w)]
         level_of_row[n] = _level_in(about, window.share)
-    for k in range(len(tile)):
+    for k in range(len(place)):
         own[k] = level_of_row[np.uintp(own[k])]
     return own
 

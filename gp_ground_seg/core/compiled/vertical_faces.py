@@ -1,14 +1,12 @@
 """Compiled twin of `gp_ground_seg.core.pipeline.vertical_faces`.
 
-In three calls: `select_tall` lists the tiles with a high return, `sum_returns` sums over the
-returns in them, the lowest and those above apart, `decide_faces` decides from the sums.
-Coordinates are rounded so that the sums are exact in any order.
+Of the tiles with a high return, the returns are summed, the lowest and those above apart; the sums
+tell which tiles hold a face. Coordinates are rounded so that the sums are exact in any order.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -34,60 +32,52 @@ NOT_TALL = -1
 _TO_UNITS = 1.5 * 2.0**52 / UNITS_PER_METRE
 
 
-class FaceSums(NamedTuple):
-    """Rows of the tall tiles, and their sums.
-
-    Attributes
-    ----------
-    tile_to_row : (T,) int32
-        First of the two rows of each occupied tile, or `NOT_TALL`.
-    row_to_tile : (T,) int32
-        Tile of each pair of rows.
-    sums : (rows, N_COLUMNS) float64
-        Sums of each row.
-    """
-
-    tile_to_row: CellArray
-    row_to_tile: CellArray
-    sums: FloatArray
-
-
 @jit(entry=True)
-def select_tall(
-    tiles: Tiles, label: LabelConfig, tile_to_row: CellArray, row_to_tile: CellArray
-) -> int:
-    """Give each tall tile its rows (see `FaceSums`); return the number of tall tiles."""
-    extremes, n_tall = tiles.extremes, 0
-    for tile in tiles.occupied:
-        t = np.uintp(tile)
+def find_faces(
+    columns: PointArray, tiles: Tiles, config: FacesConfig, label: LabelConfig, faces: Faces
+) -> None:
+    """Find the tiles of points (3, N) that hold a face, into `faces`, where there is none yet."""
+    tall, tile_to_row = _select_tall(tiles, label)
+    sums = _sum_returns(columns, tiles, tall, config.cell_size, label, tile_to_row)
+    for k in range(len(tall)):
+        low, high = sums[2 * k], sums[2 * k + 1]
+        top = max(low[_TOP], high[_TOP])
+        if top > face_height(label) and is_vertical(low, high, config):
+            faces.is_face[tall[k]] = True
+            faces.has_occluded_base[tall[k]] = is_base_occluded(low, high, config)
+
+
+@jit()
+def _select_tall(tiles: Tiles, label: LabelConfig) -> tuple[CellArray, CellArray]:
+    """List the tall tiles, (K,), and the first of the two rows of each tile, or `NOT_TALL`."""
+    extremes, n_tiles, n_tall = tiles.extremes, len(tiles.extremes), 0
+    tall, tile_to_row = np.empty(n_tiles, np.int32), np.empty(n_tiles, np.int32)
+    for t in range(n_tiles):
         height = np.float64(extremes[t, 1]) - np.float64(extremes[t, 0])
+        tile_to_row[t] = NOT_TALL
         if height > face_height(label):
-            tile_to_row[t] = 2 * n_tall
-            row_to_tile[n_tall] = tile
+            tall[n_tall], tile_to_row[t] = t, 2 * n_tall
             n_tall += 1
-        else:
-            tile_to_row[t] = NOT_TALL
-    return n_tall
+    return tall[:n_tall], tile_to_row
 
 
-@jit(entry=True)
-def sum_returns(
+@jit()
+def _sum_returns(
     columns: PointArray,
     tiles: Tiles,
+    tall: CellArray,
     tile_size: float,
     label: LabelConfig,
-    n_tall: int,
-    buffers: FaceSums,
-) -> None:
-    """Sum over the returns, (3, N), in tall tiles."""
-    sums = buffers.sums
-    _clear_sums(tiles.extremes, tile_size, n_tall, buffers.row_to_tile, sums)
+    tile_to_row: CellArray,
+) -> FloatArray:
+    """Sum over the returns, (3, N), in tall tiles: (2 * K, N_COLUMNS)."""
+    sums = _no_sums(tiles, tall, tile_size)
     foot_height, max_height = label.ground_tolerance, label.obstacle_max_height
     x, y, z, tile = columns[0], columns[1], columns[2], tiles.tile
     for i in range(len(tile)):
         if tile[i] == OUTSIDE:
             continue
-        k = buffers.tile_to_row[np.uintp(tile[i])]
+        k = tile_to_row[np.uintp(tile[i])]
         if k == NOT_TALL:
             continue
         low = sums[np.uintp(k)]
@@ -110,40 +100,21 @@ def sum_returns(
         s[8] += dx * dz
         s[9] += dy * dz
         s[_TOP] = max(s[_TOP], above)
+    return sums
 
 
 @jit()
-def _clear_sums(
-    extremes: PointArray, tile_size: float, n_tall: int, row_to_tile: CellArray, sums: FloatArray
-) -> None:
-    n_sides = int(math.sqrt(len(row_to_tile)))
+def _no_sums(tiles: Tiles, tall: CellArray, tile_size: float) -> FloatArray:
+    """Lay out the sums of no returns, with the origins of the tall tiles."""
+    n_sides, sums = int(math.sqrt(len(tiles.at))), np.empty((2 * len(tall), N_COLUMNS))
     half = 0.5 * n_sides * tile_size
-    for k in range(n_tall):
-        t = row_to_tile[k]
+    for k in range(len(tall)):
+        place = tiles.place[tall[k]]
         for row in (2 * k, 2 * k + 1):
             for c in range(_TOP + 1):
                 sums[row, c] = 0.0
         # About a point of the tile: about the sensor, rounding would exceed the scatter.
-        sums[2 * k, _TO_UNITS_X] = _TO_UNITS - ((t // n_sides) * tile_size - half)
-        sums[2 * k, _TO_UNITS_Y] = _TO_UNITS - ((t % n_sides) * tile_size - half)
-        sums[2 * k, _BASE] = extremes[t, 0]
-
-
-@jit(entry=True)
-def decide_faces(
-    n_tall: int,
-    config: FacesConfig,
-    label: LabelConfig,
-    buffers: FaceSums,
-    faces: Faces,
-) -> None:
-    """Decide from the sums which tiles hold a face, into `faces`."""
-    for t in range(len(faces.is_face)):
-        faces.is_face[t] = faces.has_occluded_base[t] = False
-    for k in range(n_tall):
-        low, high = buffers.sums[2 * k], buffers.sums[2 * k + 1]
-        top = max(low[_TOP], high[_TOP])
-        if top > face_height(label) and is_vertical(low, high, config):
-            t = buffers.row_to_tile[k]
-            faces.is_face[t] = True
-            faces.has_occluded_base[t] = is_base_occluded(low, high, config)
+        sums[2 * k, _TO_UNITS_X] = _TO_UNITS - ((place // n_sides) * tile_size - half)
+        sums[2 * k, _TO_UNITS_Y] = _TO_UNITS - ((place % n_sides) * tile_size - half)
+        sums[2 * k, _BASE] = tiles.extremes[tall[k], 0]
+    return sums

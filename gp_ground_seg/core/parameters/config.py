@@ -348,7 +348,7 @@ def size_of_tables(config: Config) -> int:
     n_tiles = math.ceil(2.0 * config.grid.r_max / config.faces.cell_size) ** 2
     n_cells = config.grid.n_segments * config.grid.n_bins
     # Held against both backends by test_robustness.py.
-    return 80 * n_tiles + 184 * n_cells
+    return 9 * n_tiles + 184 * n_cells
 
 
 def _check_memory(config: Config) -> None:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.frame import (
     NOT_FINITE,
+    OUTSIDE,
     BoolArray,
     Faces,
     FloatArray,
@@ -193,33 +194,25 @@ def mean_votes(
     means : (W,) float64
         Mean of the votes that they count [m].
     """
-    n_sides = math.isqrt(len(tiles.extremes))
-    # Places of tiles in a square with one more at each side, so that each has eight around it.
-    width = n_sides + 2
-    around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
-
-    def place_of(tile: IntArray) -> IntArray:
-        return tile + 2 * (tile // n_sides) + (width + 1)
-
+    has_obstacle, counts = np.zeros((2, len(tiles.place)), dtype=np.bool_)
     tile = as_index(tiles.tile[voters])
-    has_obstacle, counts, has_votes = np.zeros((3, width * width), dtype=np.bool_)
-    has_obstacle[place_of(tile[np.flatnonzero(margin[voters] < 0.0)])] = True
-    counts[np.flatnonzero(has_obstacle)[:, None] + around] = True
+    has_obstacle[tile[np.flatnonzero(margin[voters] < 0.0)]] = True
+    about_tile = tiles.around()
+    beside = about_tile[has_obstacle]
+    counts[beside[beside != OUTSIDE]] = True
     # Most voters are in none of these tiles.
-    is_counted = counts.reshape(width, width)[1:-1, 1:-1].ravel()[tile]
-    voters, over_lowest = voters[is_counted], over_lowest[is_counted]
-    place = place_of(tile[is_counted])
-    has_votes[place] = True
-    row_to_place = np.flatnonzero(has_votes)
-    rows = np.zeros(len(counts), dtype=np.int32)  # row 0 is that of tiles without votes
-    rows[row_to_place] = np.arange(1, len(row_to_place) + 1)
+    is_counted = counts[tile]
+    voters, over_lowest, tile = voters[is_counted], over_lowest[is_counted], tile[is_counted]
+    # The last row, whose index `OUTSIDE` is, is that of tiles without votes.
+    rows = np.full(len(tiles.place) + 1, np.count_nonzero(counts))
+    rows[np.flatnonzero(counts)] = np.arange(rows[-1])
     # Layers of a row stand between copies of the last and of the first one.
-    shape = len(row_to_place) + 1, N_LAYERS + 2
+    shape = rows[-1] + 1, N_LAYERS + 2
     layer = layer_of(over_lowest, tolerance).astype(np.int64)
-    entry = rows[place] * shape[1] + layer + 1
-    is_changed = has_obstacle[place]
-    place, layer = place[is_changed], layer[is_changed]
-    about = [rows[place + step] * shape[1] + layer for step in around]
+    entry = rows[tile] * shape[1] + layer + 1
+    is_changed = has_obstacle[tile]
+    tile, layer = tile[is_changed], layer[is_changed]
+    about = [rows[other] * shape[1] + layer for other in about_tile[tile].T]
 
     def total(weights: FloatArray | None) -> FloatArray:
         """Sum of the votes about the voters to change: of three layers, from the lowest on."""
@@ -243,7 +236,7 @@ def _near_sums(height: FloatArray, tiles: Tiles, in_face: BoolArray, units: floa
     """
     near = np.flatnonzero(is_near(height) & ~in_face)
     tile, heights = as_index(tiles.tile[near]), height[near]
-    sums = np.empty((2, len(tiles.extremes)))
+    sums = np.empty((2, len(tiles.place)))
     sums[0] = np.bincount(tile, minlength=sums.shape[1])
     sums[1] = np.bincount(tile, whole_units(heights * heights, units), sums.shape[1])
     return sums

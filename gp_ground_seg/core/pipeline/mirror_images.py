@@ -44,7 +44,7 @@ class MirrorImages(NamedTuple):
 
     def raised(self, xyz: PointArray) -> PointArray:
         """Points (N, 3), each image where what it is an image of is."""
-        result: PointArray = xyz.copy()
+        result: PointArray = xyz.copy('K')
         result[self.points, 2] += self.rise.astype(result.dtype)
         return result
 
@@ -68,15 +68,16 @@ def find_mirror_images(scan: Scan, pose: SensorPose, sensor: SensorConfig) -> Mi
     if not is_seen_from_sensor(pose) or (x, y) != (0.0, 0.0):
         return none
     candidates, grid, heights = scan.candidates, scan.grid, (-pose.height, up)
-    near = np.flatnonzero((candidates.r >= NEAREST) & (candidates.r < WET_REACH))
-    r, z = candidates.r[near], candidates.z[near]
-    is_ground = np.abs(z + pose.height) <= tolerance_at(r)
+    r, z = candidates.r, candidates.z
+    is_near = (r >= NEAREST) & (r < WET_REACH)
+    is_ground = is_near & (np.abs(z + pose.height) <= tolerance_at(r))
     most_if_dry = WET_SHARE * np.count_nonzero(is_ground)
     # Most scans end here: even if all that is deep were an image, the road would be dry.
-    if np.count_nonzero(z < -pose.height - DEEP) <= most_if_dry:
+    if np.count_nonzero(is_near & (z < -pose.height - DEEP)) <= most_if_dry:
         return none
+    r, z, is_ground = r[is_near], z[is_near], is_ground[is_near]
     slope = _slope(r, z, up)
-    nearer = _nearer_in_segment(slope, is_ground, candidates.segment[near])
+    nearer = _nearer_in_segment(slope, is_ground, candidates.segment[is_near])
     found = _is_image(r, z, slope, nearer, heights, BELOW_SIGHT)
     if np.count_nonzero(found) <= most_if_dry:
         return none

@@ -23,6 +23,8 @@ ENOUGH_POINTS = 20000
 """Points that show well enough which way is up."""
 LARGEST = {4: 1e38, 8: 1e300}
 """By bytes: coordinates beyond this are taken to be this [m]: sums of three still are numbers."""
+SINGLE = 2.0**-23
+"""Rounding of single precision, in parts of a number."""
 _MAX_BEYOND = 0.1  # share of the points that may lie there, as wrong returns
 _N_JUDGED = 1000  # points looked at in a larger cloud
 _MANY, _MANY_SHARE = 1000, 0.03  # points, and share of all, that repeat one place: no returns do
@@ -40,7 +42,8 @@ def take_points(points: npt.ArrayLike, origin: Place | None = None) -> PointArra
 
     Of `points` (N, >=3) columns after the third are ignored. The result (N, 3) shares memory with
     them, if it can; it is of single precision for types of up to four bytes. With the `origin` of
-    the sensor [m] points that are no returns become NaN, in a copy: see `without_empty_rays`.
+    the sensor [m] it is a copy, each coordinate contiguous, and points that are no returns are NaN
+    in it: see `leave_out_empty_rays`.
     Raises a PointCloudError if the shape or type is another, the array is masked or transposed,
     or the points are farther away than `FARTHEST`.
     """
@@ -59,54 +62,56 @@ def take_points(points: npt.ArrayLike, origin: Place | None = None) -> PointArra
         raise PointCloudError(
             f'points of shape {array.shape} and type {array.dtype}: must be floating point'
         )
-    if problem := objection_to_ranges(array[:: 1 + len(array) // _N_JUDGED, :3]):
-        raise PointCloudError(problem)
     xyz = array[:, :3]
     # Bytes from a sensor may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore', over='ignore'):
         if array.dtype not in COMPUTED or not array.flags.aligned:
             dtype = np.dtype(np.float32 if array.dtype.itemsize <= 4 else np.float64)
             xyz = xyz.astype(dtype, copy=not array.flags.aligned)
-        return xyz if origin is None else without_empty_rays(xyz, origin, array.dtype)
+        if origin is not None:
+            xyz = np.array(xyz, order='F')
+            leave_out_empty_rays(xyz, origin, array.dtype)
+    if problem := objection_to_ranges(xyz[:: 1 + len(xyz) // _N_JUDGED]):
+        raise PointCloudError(problem)
+    return xyz
 
 
-def without_empty_rays(xyz: PointArray, origin: Place, written: np.dtype[Any]) -> PointArray:
-    """Return points (N, 3) with NaN in place of those at the sensor, or `xyz` if there are none.
+def leave_out_empty_rays(xyz: PointArray, origin: Place, written: np.dtype[Any]) -> None:
+    """Set the points (N, 3) at the sensor to NaN.
 
     Drivers send rays without a return as (0, 0, 0), which a change of frame moves to the `origin`
     of the sensor [m]. It is compared as rounded to the type `written`, or to single precision if
     that has more digits: coordinates mostly were of single precision once. Where nobody has given
     the origin, it is a place that many points share; so are those of several sensors.
     """
-    rounding = float(max(np.finfo(written).eps, np.finfo(np.float32).eps))
-    x = np.ascontiguousarray(xyz[:, 0])
-    empty = [_points_at(place, x, xyz, rounding) for place in {(0.0, 0.0, 0.0), origin}]
-    for place in _shared_places(x, xyz):
-        alike = _points_at(place, x, xyz, 0.0)
+    rounding = SINGLE if written.itemsize >= 4 else float(np.finfo(written).eps)
+    empty = [_points_at(place, xyz, rounding) for place in {(0.0, 0.0, 0.0), origin}]
+    for place in _shared_places(xyz):
+        alike = _points_at(place, xyz, 0.0)
         empty += [alike] if len(alike) >= max(_MANY, _MANY_SHARE * len(xyz)) else []
-    if not any(map(len, empty)):
-        return xyz
-    xyz = np.array(xyz, order='F')
-    xyz[np.concatenate(empty)] = np.nan
-    return xyz
+    for indices in empty:
+        xyz[indices] = np.nan
 
 
-def _points_at(place: Place, x: PointArray, xyz: PointArray, rounding: float) -> IntArray:
-    """Return the points (N, 3), with their `x` (N,), that are at `place` but for `rounding`."""
-    tolerance = rounding * max(map(abs, place))
-    # Few points have this x, and only those are looked at further.
-    near = np.flatnonzero(np.abs(x - place[0]) <= tolerance if tolerance else x == place[0])
+def _points_at(place: Place, xyz: PointArray, rounding: float) -> IntArray:
+    """Return the points (N, 3) that are at `place` but for `rounding`."""
+    tolerance, x = rounding * max(map(abs, place)), xyz[:, 0]
+    # Few points have this x, mostly none, and only those are looked at further.
+    is_near = np.abs(x - place[0]) <= tolerance if tolerance else x == place[0]
+    if not is_near.any():
+        return np.zeros(0, np.int64)
+    near = np.flatnonzero(is_near)
     for axis in (1, 2):
         near = near[np.abs(xyz[near, axis] - place[axis]) <= tolerance]
     return near
 
 
-def _shared_places(x: PointArray, xyz: PointArray) -> list[Place]:
-    """Return where sensors may be: what several of the points (N, 3), with their `x` (N,), are."""
-    if len(x) < _MANY:
+def _shared_places(xyz: PointArray) -> list[Place]:
+    """Return where sensors may be: what several of the points (N, 3) are."""
+    if len(xyz) < _MANY:
         return []
-    sample = (_SAMPLE * len(x)).astype(np.int64)
-    ordered = np.sort(x[sample])
+    sample = (_SAMPLE * len(xyz)).astype(np.int64)
+    ordered = np.sort(xyz[sample, 0])
     if not (ordered[_N_ALIKE - 1 :] == ordered[: 1 - _N_ALIKE]).any():
         return []
     rows, number = np.unique(xyz[sample], axis=0, return_counts=True)
@@ -141,8 +146,10 @@ def without_box(
 @np.errstate(all='ignore')
 def objection_to_ranges(xyz: PointArray) -> str:
     """Return what is wrong where points (N, 3) are farther away than a sensor measures, or ''."""
-    x, y, z = np.abs(xyz).T
-    is_beyond = finite_points(xyz) & ((x > FARTHEST) | (y > FARTHEST) | (z > FARTHEST))
+    is_beyond = (np.abs(xyz) > FARTHEST).any(axis=1)
+    if not is_beyond.any():
+        return ''
+    is_beyond &= finite_points(xyz)
     if is_beyond.sum() <= _MAX_BEYOND * len(xyz):
         return ''
     middle = ', '.join(f'{value:.1f}' for value in np.median(xyz[is_beyond], axis=0))
@@ -158,15 +165,9 @@ def check_points(points: npt.ArrayLike) -> FloatArray:
     return np.array(take_points(points), dtype=np.float64, order='F')
 
 
-def copy_points(xyz: PointArray, columns: PointArray) -> None:
-    """Copy points (N, 3) to `columns` (3, N), of their type: the caller may change its array."""
-    with np.errstate(invalid='ignore'):
-        columns[...] = xyz.T
-
-
-def points_in(columns: PointArray) -> PointArray:
-    """Return points (N, 3), read-only, whose coordinates lie in `columns` (3, N)."""
-    result: PointArray = columns.T
+def in_columns(xyz: PointArray) -> PointArray:
+    """Points (N, 3), read-only, with each coordinate contiguous; a copy if they are not."""
+    result: PointArray = np.ascontiguousarray(xyz.T).T
     # To compiled code, arrays that may be written to are another type.
     result.flags.writeable = False
     return result

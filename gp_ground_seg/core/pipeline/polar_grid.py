@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.frame import (
-    NO_TILE,
     NOT_FINITE,
     OUTSIDE,
     Candidates,
@@ -25,7 +24,7 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, GridConfig
-from gp_ground_seg.core.pipeline.points import copy_points, finite_points, points_in
+from gp_ground_seg.core.pipeline.points import finite_points, in_columns
 
 LARGEST_TABLE = 2**20
 EARLY = 0.1
@@ -34,13 +33,11 @@ single precision in the largest table."""
 
 
 def build_scan(xyz: PointArray, config: Config) -> Scan:
-    """Copy points, sort them into cells and tiles, and take the lowest point of each cell.
+    """Sort points into cells and tiles, and take the lowest point of each cell.
 
     `xyz` (N, 3) are of a level frame [m]; ranges and angles are computed in their precision.
     """
-    columns = np.empty((3, len(xyz)), dtype=xyz.dtype)
-    copy_points(xyz, columns)
-    xyz = points_in(columns)
+    xyz = in_columns(xyz)
     geometry = grid_geometry(config.grid, config.faces.cell_size, xyz.dtype)
     grid = build_polar_grid(xyz, geometry)
     tiles = build_tiles(xyz, grid, geometry)
@@ -206,20 +203,24 @@ def build_tiles(xyz: PointArray, grid: PolarGrid, geometry: GridGeometry) -> Til
     per_metre = xyz.dtype.type(geometry.tiles_per_metre)
     # Places instead of a mask: it is used five times.
     inside = np.flatnonzero(grid.inside)
-    tile = np.full(len(xyz), OUTSIDE, dtype=np.int32)
     column, row = (
-        np.minimum(((xyz[:, i][inside] + half) * per_metre).astype(np.int32), side - 1)
+        np.minimum(((xyz[:, i][inside] + half) * per_metre).astype(np.int64), side - 1)
         for i in range(2)
     )
-    tile[inside] = column * side + row
-    place, z = as_index(tile[inside]), xyz[:, 2][inside]
-    extremes = np.empty((2, side * side), dtype=xyz.dtype)
-    lowest_z, highest_z = extremes
+    place_of_point = column * side + row
+    is_occupied = np.zeros(side * side, dtype=np.bool_)
+    is_occupied[place_of_point] = True
+    place, at = np.flatnonzero(is_occupied), np.full(side * side, OUTSIDE, dtype=np.int32)
+    at[place] = np.arange(len(place))
+    tile = np.full(len(xyz), OUTSIDE, dtype=np.int32)
+    own, z = at[place_of_point], xyz[:, 2][inside]
+    tile[inside] = own
+    own = as_index(own)
+    lowest_z, highest_z = extremes = np.empty((2, len(place)), dtype=xyz.dtype)
     lowest_z[:], highest_z[:] = np.inf, -np.inf
-    np.minimum.at(lowest_z, place, z)
-    np.maximum.at(highest_z, place, z)
-    occupied = np.flatnonzero(highest_z > -np.inf).astype(np.int32)
-    return Tiles(tile, extremes.T, occupied)
+    np.minimum.at(lowest_z, own, z)
+    np.maximum.at(highest_z, own, z)
+    return Tiles(tile, extremes.T, place.astype(np.int32), at)
 
 
 def reduce_cells(
@@ -227,15 +228,15 @@ def reduce_cells(
 ) -> tuple[PointArray, CellArray]:
     """Lowest and highest point of each cell, and the number of its points.
 
-    Of equally low points the nearest counts, then the one in the first tile, then the one of the
-    least x, then of the least y, so that the order of the points does not matter.
+    Of equally low points the nearest counts, then the one in the tile of the first place, then the
+    one of the least x, then of the least y, so that the order of the points does not matter.
 
     Returns, for points `xyz` (N, 3) [m] and the `tile` (N,) of each:
 
     extremes, (M * n_bins, 5), in the precision of the points: height of the lowest point, its
     range, height of the highest point, x and y of the lowest point [m]; infinite, but minus
     infinite for the highest point, in empty cells;
-    numbers, (M * n_bins, 2): number of points; tile of the lowest point, or `NO_TILE`.
+    numbers, (M * n_bins, 2): number of points; tile of the lowest point.
     """
     size = grid.n_segments * grid.n_bins
     inside = np.flatnonzero(grid.inside)
@@ -249,14 +250,14 @@ def reduce_cells(
     np.minimum.at(lowest_r, cell[lowest], r_inside[lowest])
     lowest = lowest[r_inside[lowest] == lowest_r[cell[lowest]]]
     # What is left is mostly one point of each cell.
-    places = cell[lowest]
-    lowest_tile = np.full(size, NO_TILE, dtype=np.int32)
-    np.minimum.at(lowest_tile, places, tile[inside[lowest]])
-    lowest = lowest[tile[inside[lowest]] == lowest_tile[places]]
     x, y = xyz[:, 0][inside[lowest]], xyz[:, 1][inside[lowest]]
-    order = np.lexsort((y, x))[::-1]  # the first one is written last
+    # The first one is written last. Tiles are numbered by their places here.
+    order = np.lexsort((y, x, tile[inside[lowest]]))[::-1]
+    places, lowest = cell[lowest[order]], inside[lowest[order]]
     lowest_x, lowest_y = np.full((2, size), np.inf, dtype=z.dtype)
-    lowest_x[cell[lowest[order]]], lowest_y[cell[lowest[order]]] = x[order], y[order]
+    lowest_x[places], lowest_y[places] = x[order], y[order]
+    lowest_tile = np.full(size, OUTSIDE, dtype=np.int32)
+    lowest_tile[places] = tile[lowest]
     number = np.bincount(cell, minlength=size).astype(np.int32)
     return (
         np.column_stack([lowest_z, lowest_r, highest_z, lowest_x, lowest_y]),

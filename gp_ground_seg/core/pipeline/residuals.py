@@ -37,6 +37,7 @@ from gp_ground_seg.core.frame import (
     Label,
     Labelled,
     PolarGrid,
+    as_index,
 )
 
 PRIOR_CELLS = 0.05
@@ -134,8 +135,9 @@ def _sums(labelled: Labelled, grid: PolarGrid) -> tuple[BoolArray, tuple[FloatAr
     squared number, the sum of their residuals [m], of the squares [m^2], and over the cells of
     number times squared mean [m^2].
     """
-    is_ground = (labelled.label == Label.GROUND) & grid.inside
-    cell, residual = grid.cell[is_ground], np.rint(labelled.height[is_ground] * UNITS)
+    # A plain integer: comparing with an enumeration is five times slower.
+    is_ground = (labelled.label == int(Label.GROUND)) & grid.inside
+    cell, residual = as_index(grid.cell[is_ground]), np.rint(labelled.height[is_ground] * UNITS)
     shape = grid.n_segments, grid.n_bins
 
     def by_cell(weights: FloatArray | None) -> FloatArray:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import FloatArray, IntArray, Tiles
+from gp_ground_seg.core.frame import CellArray, FloatArray, IntArray, Tiles, as_index
 
 EDGES = 0.01 * 1.14 ** np.arange(31)
 SQUARE_EDGES = EDGES * EDGES
@@ -39,7 +39,7 @@ MOST_OVER_WIDE = 3.4
 
 
 def ground_roughness(tiles: Tiles, sums: FloatArray, units: float) -> FloatArray:
-    """Roughness of the ground in each tile, (T,) [m]; 0 where no return is near the surface.
+    """Roughness of the ground in each tile, (T + 1,) [m]; 0 where no return is near the surface.
 
     Parameters
     ----------
@@ -50,8 +50,10 @@ def ground_roughness(tiles: Tiles, sums: FloatArray, units: float) -> FloatArray
         squared heights over the surface, in whole units.
     units : float
         Units for 1 m^2.
+
+    The last one, for points in no tile, is 0.
     """
-    n_sides, roughness = math.isqrt(len(tiles.extremes)), np.zeros(len(tiles.extremes))
+    roughness = np.zeros(len(tiles.place) + 1)
     known = np.flatnonzero(sums[0])
     if len(known) == 0:
         return roughness
@@ -60,7 +62,7 @@ def ground_roughness(tiles: Tiles, sums: FloatArray, units: float) -> FloatArray
     counts = np.bincount(level, minlength=N_LEVELS)
     of_frame = int(_level_at(counts[None, :], 0.5)[0])
     near, wide = (
-        ROUGHNESS[_levels_about(known, level, n_sides, window, of_frame)]
+        ROUGHNESS[_levels_about(tiles.place[known], level, tiles.n_sides, window, of_frame)]
         for window in (NEAR, WIDE)
     )
     roughness[known] = np.minimum(near, MOST_OVER_WIDE * wide)
@@ -68,21 +70,25 @@ def ground_roughness(tiles: Tiles, sums: FloatArray, units: float) -> FloatArray
 
 
 def _levels_about(
-    tile: IntArray, level: IntArray, n_sides: int, window: Window, of_frame: int
+    places: CellArray, level: IntArray, n_sides: int, window: Window, of_frame: int
 ) -> IntArray:
-    """Level about each of the tiles (K,) of known `level`; `of_frame` is the median of them."""
-    column, row = np.divmod(tile, n_sides)
+    """Level about the tiles at `places` (K,), of known `level`; `of_frame` is their median."""
+    column, row = np.divmod(as_index(places), n_sides)
     # Blocks in a square with one more at each side, so that each has eight around it.
     width = (n_sides - 1 >> window.shift) + 3
     place = ((column >> window.shift) + 1) * width + (row >> window.shift) + 1
-    blocks, own = np.unique(place, return_inverse=True)
+    has_tiles = np.zeros(width * width, dtype=np.bool_)
+    has_tiles[place] = True
+    blocks = np.flatnonzero(has_tiles)
+    # The last row stays empty: blocks without tiles.
+    shape = len(blocks) + 1, N_LEVELS
     block_to_row = np.full(width * width, len(blocks))
     block_to_row[blocks] = np.arange(len(blocks))
-    # The last row stays empty: blocks without tiles.
-    counts = np.zeros((len(blocks) + 1, N_LEVELS), dtype=np.int64)
-    np.add.at(counts, (own, level), 1)
-    around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
-    total = counts[block_to_row[blocks[:, None] + around]].sum(axis=1)
+    own = block_to_row[place]
+    counts = np.bincount(own * N_LEVELS + level, minlength=shape[0] * N_LEVELS).reshape(shape)
+    total = np.zeros((len(blocks), N_LEVELS), dtype=np.int64)
+    for step in (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel():
+        total += counts[block_to_row[blocks + step]]
     total[:, of_frame] += window.prior
     result: IntArray = _level_at(total, window.share)[own]
     return result

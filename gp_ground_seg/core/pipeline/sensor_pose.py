@@ -143,10 +143,12 @@ class SensorPose:
         """Matrix (3, 3) from the sensor frame to the level frame."""
         return rotation(self.roll, self.pitch)
 
-    @usual_errors()
     def level(self, xyz: PointArray) -> PointArray:
         """Points (N, 3) of the sensor frame in the level frame; `xyz` itself without tilt."""
-        return xyz if self.is_level else rotate(xyz, self.rotation)
+        if self.is_level:
+            return xyz
+        with usual_errors():
+            return rotate(xyz, self.rotation)
 
     @usual_errors()
     def ground_z(self, z: PointArray, height: FloatArray) -> FloatArray:
@@ -245,6 +247,7 @@ def _doubts(sensor: SensorConfig, view: View) -> tuple[str, ...]:
     return (LOW_GROUND,) * bool(is_low) + (LITTLE_GROUND,) * bool(is_little)
 
 
+@lru_cache(maxsize=4)
 def origin_of(sensor: SensorConfig) -> Direction:
     """Place of the sensor in the frame levelled by `given_pose` [m]."""
     place = given_pose(sensor).rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)

@@ -8,8 +8,6 @@ ground in its tile; the lowest return of the tile then belongs to the face.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from gp_ground_seg.core.frame import OUTSIDE, Faces, FloatArray, IntArray, Scan, Values, as_index
@@ -38,13 +36,13 @@ def find_faces(scan: Scan, config: Config) -> Faces:
     ``label.obstacle_max_height`` above the lowest may overhang, and are left out.
     """
     tiles, faces, label = scan.tiles, config.faces, config.label
-    n_tiles = len(tiles.extremes)
-    lowest_z, highest_z = tiles.extremes[tiles.occupied].astype(np.float64).T
+    result, n_sides = Faces.none(tiles), tiles.n_sides
+    lowest_z, highest_z = tiles.extremes.astype(np.float64).T
     # Most returns are in tiles where nothing stands, and are left out.
-    is_tall = highest_z - lowest_z > face_height(label)
-    tall, lowest_z = tiles.occupied[is_tall], lowest_z[is_tall]
+    tall = np.flatnonzero(highest_z - lowest_z > face_height(label))
+    lowest_z = lowest_z[tall]
     # One more than there are tiles: `OUTSIDE` is the index of the last.
-    row_of_tile = np.full(n_tiles + 1, OUTSIDE)
+    row_of_tile = np.full(len(result.is_face), OUTSIDE)
     row_of_tile[tall] = np.arange(len(tall))
     row = row_of_tile[as_index(tiles.tile)]
     used = np.flatnonzero(row != OUTSIDE)
@@ -53,11 +51,10 @@ def find_faces(scan: Scan, config: Config) -> Faces:
     used, above = used[low], above[low]
     row = row[used]
     # Relative to a point of the tile: about the sensor, rounding would exceed the scatter.
-    n_sides = math.isqrt(n_tiles)
     x, y = (
         scan.xyz[used, i]
         - _rounded(place * faces.cell_size - 0.5 * n_sides * faces.cell_size)[row]
-        for i, place in enumerate(np.divmod(tall, n_sides))
+        for i, place in enumerate(np.divmod(tiles.place[tall], n_sides))
     )
     # Rows of the foot first, then those of the rest.
     is_rest = above > label.ground_tolerance
@@ -65,7 +62,6 @@ def find_faces(scan: Scan, config: Config) -> Faces:
     foot, rest = sums[:, : len(tall)], sums[:, len(tall) :]
     reaches = np.zeros(len(tall), dtype=np.bool_)
     reaches[row[above > face_height(label)]] = True
-    result = Faces(*np.zeros((2, n_tiles), dtype=np.bool_))
     result.is_face[tall] = reaches & is_vertical(foot, rest, faces)
     result.has_occluded_base[tall] = result.is_face[tall] & is_base_occluded(foot, rest, faces)
     return result
