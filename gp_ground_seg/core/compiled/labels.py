@@ -212,12 +212,12 @@ def _vote(
 
     `lowest` is that of `lowest_of` [m].
     """
-    obstacle_tiles, rows, n_rows = _number_tiles(scan.tiles, has_obstacle)
+    rows, around, n_rows = _number_tiles(scan.tiles, has_obstacle)
     votes = np.zeros((n_rows, N_LAYERS), np.int64)
     voters, places = _count_votes(
-        scan, lowest, rows, len(obstacle_tiles), config, result, votes.reshape(-1)
+        scan, lowest, rows, len(around), config, result, votes.reshape(-1)
     )
-    sums = _sum_around(obstacle_tiles, scan.tiles, rows, votes)
+    sums = _sum_around(around, votes)
     margins, unit = result.margin, config.ground_tolerance / VOTE_UNITS
     for n in range(len(voters)):
         i, place = np.uintp(voters[n]), places[n]
@@ -234,27 +234,30 @@ def _vote(
 def _number_tiles(tiles: Tiles, has_obstacle: BoolArray) -> tuple[CellArray, CellArray, int]:
     """Give rows in the table of votes to tiles with an obstacle, from 1 on, then to those around.
 
-    Returns the tiles of the first rows, the row of each tile, (T + 1,), and the number of rows.
-    Row 0 is for the other tiles, and gets no votes.
+    Returns the row of each tile, (T + 1,), for each of the first rows those around it and its own,
+    (R, 9), and the number of rows. Row 0 is for the other tiles, and gets no votes.
     """
     at, n_tiles, n_rows = tiles.at, len(tiles.place), 1
-    n_sides = int(math.sqrt(len(at)))
-    obstacle_tiles, rows = np.empty(n_tiles + 1, np.int32), np.zeros(n_tiles + 1, np.int32)
+    n_sides, rows = int(math.sqrt(len(at))), np.zeros(n_tiles + 1, np.int32)
     for t in range(n_tiles):
         if has_obstacle[t]:
-            obstacle_tiles[n_rows], rows[t] = t, n_rows
+            rows[t] = n_rows
             n_rows += 1
-    obstacle_tiles = obstacle_tiles[:n_rows]
-    for t in obstacle_tiles[1:]:
-        place = tiles.place[np.uintp(t)]
-        column, row = place // n_sides, place % n_sides
+    around = np.zeros((n_rows, 9), np.int32)
+    for t in range(n_tiles):
+        if not has_obstacle[t]:
+            continue
+        column, row, n = tiles.place[t] // n_sides, tiles.place[t] % n_sides, 0
         for x in range(max(column - 1, 0), min(column + 2, n_sides)):
             for y in range(max(row - 1, 0), min(row + 2, n_sides)):
                 beside = at[np.uintp(x * n_sides + y)]
-                if beside >= 0 and rows[np.uintp(beside)] == 0:
-                    rows[np.uintp(beside)] = n_rows
-                    n_rows += 1
-    return obstacle_tiles, rows, n_rows
+                if beside >= 0:
+                    if rows[np.uintp(beside)] == 0:
+                        rows[np.uintp(beside)] = n_rows
+                        n_rows += 1
+                    around[rows[t], n] = rows[np.uintp(beside)]
+                    n += 1
+    return rows, around, n_rows
 
 
 @jit(part=True)
@@ -262,7 +265,7 @@ def _count_votes(
     scan: Scan,
     lowest: float,
     rows: CellArray,
-    n_obstacle_tiles: int,
+    n_obstacle_rows: int,
     config: LabelConfig,
     result: Labelled,
     votes: IntArray,
@@ -281,27 +284,20 @@ def _count_votes(
             place = row * N_LAYERS + int(layer_of(over_lowest, tolerance))
             vote = vote_of(result.margin[i], tolerance)
             votes[np.uintp(place)] += VOTER_FLAG + int(vote + VOTE_UNITS)
-            if row < n_obstacle_tiles:
+            if row < n_obstacle_rows:
                 voters[n], places[n] = i, place
                 n += 1
     return voters[:n], places[:n]
 
 
 @jit(part=True)
-def _sum_around(
-    obstacle_tiles: CellArray, tiles: Tiles, rows: CellArray, votes: IntArray
-) -> IntArray:
+def _sum_around(around: CellArray, votes: IntArray) -> IntArray:
     """Sum the votes of each tile with an obstacle and the eight around it, layer by layer."""
-    at, sums = tiles.at, np.zeros((len(obstacle_tiles), N_LAYERS), np.int64)
-    n_sides = int(math.sqrt(len(at)))
-    for k in range(1, len(obstacle_tiles)):
-        place, about = tiles.place[np.uintp(obstacle_tiles[k])], sums[k]
-        column, row = place // n_sides, place % n_sides
-        for x in range(max(column - 1, 0), min(column + 2, n_sides)):
-            for y in range(max(row - 1, 0), min(row + 2, n_sides)):
-                t = at[np.uintp(x * n_sides + y)]
-                if t >= 0:
-                    beside = votes[np.uintp(rows[np.uintp(t)])]
-                    for layer in range(N_LAYERS):
-                        about[layer] += beside[layer]
+    sums = np.zeros((len(around), N_LAYERS), np.int64)
+    for k in range(1, len(around)):
+        own = sums[k]
+        for n in range(9):
+            beside = votes[np.uintp(around[k, n])]
+            for layer in range(N_LAYERS):
+                own[layer] += beside[layer]
     return sums.reshape(-1)
