@@ -193,9 +193,8 @@ def test_every_nth_segment_by_itself_has_the_inliers_it_has_in_the_frame(step):
     own = every_segment(frame, step)
     kept = np.isin(frame.candidates.segment, np.arange(0, config.grid.n_segments, step))
     theta = given_theta(config)
-    # Copied, as the next call reuses the buffer of the length-scales.
     (whole, whole_u), (alone, alone_u) = (
-        (surface.inlier, u.copy())
+        (surface.inlier, u)
         for one in (frame, own)
         for surface, _, u in [MODEL.estimate_surface(one, theta, config)]
     )

@@ -231,8 +231,8 @@ def test_a_tilt_beyond_46_degrees_is_refused_with_its_angles(degrees, start):
     assert contradiction == line
 
 
-def test_a_search_leaves_the_buffers_of_the_scan_as_they_were():
-    """What is steep is looked at again in buffers that the scan lies in."""
+def test_a_search_leaves_the_scan_as_it_was():
+    """What is steep is looked at again, levelled."""
     lean = tilted(scan_of('urban', SMALL_OS1, 1.5).points, math.radians(35.0), 0.0)
     fast, plain = (
         segmenter(backend, roll=0.0, pitch=0.0).segment(lean)

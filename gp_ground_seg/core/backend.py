@@ -41,8 +41,7 @@ _warned_slow = False
 class Backend(Protocol):
     """One method per stage; theta (T,) are the hyper-parameters of the frame.
 
-    Each takes the values of the stages before and returns new ones. Those of `build_grid` may lie
-    in buffers that the next scan reuses.
+    Each takes the values of the stages before and returns new ones.
     """
 
     @property

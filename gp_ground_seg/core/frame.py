@@ -192,10 +192,7 @@ class Candidates(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """Points of a level frame, sorted into the polar grid and into tiles.
-
-    `tiles` may lie in buffers of the backend, which its next scan reuses.
-    """
+    """Points of a level frame, sorted into the polar grid and into tiles."""
 
     xyz: PointArray  # (N, 3) points [m], each coordinate contiguous (Fortran order), read-only
     grid: PolarGrid  # cells of the points

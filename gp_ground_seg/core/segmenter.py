@@ -235,7 +235,7 @@ class GroundSegmenter:
         """Do nothing."""
 
     def __reduce__(self) -> NoReturn:
-        """Refuse to be pickled or copied: there are a lock and buffers."""
+        """Refuse to be pickled or copied: there is a lock."""
         raise TypeError(
             'a GroundSegmenter cannot be pickled or copied: pass its config, and make a '
             'GroundSegmenter of that'
@@ -274,7 +274,6 @@ class GroundSegmenter:
         below = view = self._look(scan, UPRIGHT, origin)
         if is_doubtful(below):
             view = self._find_ground(level, below, origin)
-            scan = backend.build_grid(level, config)  # its buffers have been used
         if view is not None and not view.can_level:
             # The scan will not be levelled: the ground that matters is about level.
             elsewhere = view if view.tells_tilt else None

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import math
-import os
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
 from gp_ground_seg.core.compiled import (
     evidence,
@@ -20,7 +15,6 @@ from gp_ground_seg.core.compiled import (
 )
 from gp_ground_seg.core.compiled import relief as relief_
 from gp_ground_seg.core.compiled import vertical_faces as faces_
-from gp_ground_seg.core.compiled.polar_grid import TileTable
 from gp_ground_seg.core.frame import (
     BoolArray,
     Candidates,
@@ -50,88 +44,30 @@ from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
 from gp_ground_seg.core.pipeline.relief import Relief
 
 
-class Buffers:
-    """Arrays by name, as long as the largest frame so far needed.
-
-    A new array of a megabyte costs as much as a pass over it: its pages are
-    mapped and cleared one by one. What is taken from here must not outlive the frame.
-    """
-
-    def __init__(self) -> None:
-        self._arrays: dict[str, npt.NDArray[Any]] = {}
-        self._views: dict[str, npt.NDArray[Any]] = {}
-        self._tiles: TileTable | None = None
-
-    def take(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        """Array of that shape with arbitrary content, C-contiguous.
-
-        Parameters
-        ----------
-        name : str
-            One name, one purpose: a second call with it returns the same memory.
-        shape : tuple of int
-            Shape wanted.
-        dtype : dtype
-            Type of the elements.
-        """
-        view = self._views.get(name)
-        if view is not None and view.shape == shape and view.dtype == dtype:
-            return view
-        size = math.prod(shape)
-        held = self._arrays.get(name)
-        if held is None or len(held) < size or held.dtype != np.dtype(dtype):
-            held = self._arrays[name] = np.empty(size, dtype=dtype)
-        view = self._views[name] = held[:size].reshape(shape)
-        return view
-
-    def tile_table(self, n_places: int, n_points: int, dtype: npt.DTypeLike) -> TileTable:
-        """Table as the last scan left it, or a new one of the size wanted."""
-        held, capacity = self._tiles, min(n_places, n_points)
-        fits = held is not None and len(held.at) == n_places and len(held.place) >= capacity
-        if held is None or not fits or held.extremes.dtype != dtype:
-            held = self._tiles = None  # the old one is freed before there is a new one
-            held = self._tiles = TileTable.empty(n_places, capacity, dtype)
-        return held
-
-
 class NumbaBackend:
-    """See `gp_ground_seg.core.backend.Backend`.
-
-    A process that is forked while a thread of this one segments has half-filled buffers: it begins
-    with new ones.
-    """
+    """See `gp_ground_seg.core.backend.Backend`."""
 
     name = 'numba'
-
-    def __init__(self) -> None:
-        self._pid, self._buffers = os.getpid(), Buffers()
 
     def build_grid(self, xyz: PointArray, config: Config) -> Scan:
         """Sort points into cells and tiles; lowest point of each cell."""
         announce_compiling()
-        if self._pid != os.getpid():
-            self._pid, self._buffers = os.getpid(), Buffers()
-        xyz = in_columns(xyz)
-        n_points, dtype, take = len(xyz), xyz.dtype, self._buffers.take
+        xyz, n_points, dtype = in_columns(xyz), len(xyz), xyz.dtype
         geometry = grid_geometry(config.grid, config.faces.cell_size, dtype)
-        n_segments, n_cells = config.grid.n_segments, config.grid.n_segments * config.grid.n_bins
-        cell, r = np.empty(n_points, dtype=np.int32), np.empty(n_points, dtype=dtype)
-        places = polar_grid.Places(cell, r, take('tile', (n_points,), np.int32))
-        cells = polar_grid.CellTable(
-            take('extremes', (n_cells + 1, 5), dtype),
-            take('numbers', (n_cells + 1, 2), np.int32),
-        )
-        tiles = self._buffers.tile_table(geometry.n_sides**2, n_points, dtype)
-        buffers = Candidates.buffers(n_cells, n_segments)
+        n_segments, n_bins = config.grid.n_segments, config.grid.n_bins
+        cell, tile = np.empty(n_points, np.int32), np.empty(n_points, np.int32)
+        grid = PolarGrid(cell, np.empty(n_points, dtype), geometry.edges, n_segments)
+        n_places = geometry.n_sides**2
+        n = min(n_points, n_places)
+        at = np.empty(n_places, np.int32)
+        tiles = Tiles(tile, np.empty((n, 2), dtype), np.empty(n, np.int32), at)
+        candidates = Candidates.buffers(n_segments * n_bins, n_segments)
         min_extent = config.lines.min_density_extent
-        n = polar_grid.build_grid(xyz.T, geometry, min_extent, places, cells, tiles, buffers)
-        n_tiles = tiles.number[0]
-        return Scan(
-            xyz,
-            PolarGrid(cell, r, geometry.edges, n_segments),
-            Tiles(places.tile, tiles.extremes[:n_tiles], tiles.place[:n_tiles], tiles.at),
-            buffers.first(n),
+        n, n_candidates = polar_grid.build_grid(
+            xyz.T, geometry, min_extent, grid, tiles, candidates
         )
+        tiles = tiles._replace(extremes=tiles.extremes[:n], place=tiles.place[:n])
+        return Scan(xyz, grid, tiles, candidates.first(n_candidates))
 
     def fit_plane(
         self, candidates: Candidates, max_slope: float, origin: Direction
@@ -200,7 +136,6 @@ class NumbaBackend:
             config.length_scale.model == 'latent',
             uses_neighbours_in(frame, config),
             config.label.rule == 'roughness',
-            self._buffers.take('evidence', (2, 2, *shape), np.float64),
             by_itself,
             mean,
             std,
@@ -211,17 +146,16 @@ class NumbaBackend:
     def _surfaces(self, frame: Frame, config: Config) -> ground.SegmentSurfaces:
         """Surfaces to be set, with log length-scales, to be set as well if they are latent."""
         n, shape = len(frame.candidates.r), (frame.candidates.n_segments, len(frame.knots))
-        take = self._buffers.take
         if config.length_scale.model == 'latent':
-            u, knot_u = take('u', (n,), np.float64), np.empty(shape)
+            u, knot_u = np.empty(n), np.empty(shape)
         else:
             u, knot_u = given_log_length_scales(frame, config.length_scale)
         return ground.SegmentSurfaces(
             u,
             knot_u,
-            take('seed', (n,), np.bool_),
             np.empty(n, np.bool_),
-            *take('surfaces', (2, *shape), np.float64),
+            np.empty(n, np.bool_),
+            *np.empty((2, *shape)),
         )
 
     def label_points(

@@ -33,7 +33,6 @@ def estimate_surface(
     is_latent: bool,
     looks_aside: bool,
     by_roughness: bool,
-    evidence: FloatArray,
     by_itself: SegmentSurfaces,
     mean: FloatArray,
     std: FloatArray,
@@ -41,11 +40,11 @@ def estimate_surface(
     """Do what `gp_ground_seg.core.gp.ground.estimate_surface` does, into the last three.
 
     `is_latent` and `by_roughness` are the model of the length-scale and the rule of the labels by
-    the parameters, `looks_aside` is `uses_neighbours_in`. `evidence` (2, 2, M, K) has arbitrary
-    content.
+    the parameters, `looks_aside` is `uses_neighbours_in`.
     """
-    slope_std, knots = observation.slope_std, frame.knots
-    own, table, nothing = evidence[0], evidence[1], np.empty((2, 0, 0))
+    slope_std, knots, (n_segments, n_knots) = observation.slope_std, frame.knots, mean.shape
+    own, nothing = np.empty((2, n_segments, n_knots)), np.empty((2, 0, 0))
+    table = np.empty((2, n_segments, n_knots))
     if is_latent:
         u, knot_u = by_itself.log_length_scale, by_itself.knot_log_length_scale
         latent_log_length_scales(frame, theta, 1, u, knot_u)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from gp_ground_seg.core.frame import (
     NOT_FINITE,
@@ -14,8 +12,9 @@ from gp_ground_seg.core.frame import (
     Candidates,
     CellArray,
     FloatArray,
-    IntArray,
     PointArray,
+    PolarGrid,
+    Tiles,
 )
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.pipeline.polar_grid import (
@@ -29,80 +28,32 @@ BLOCK = 512
 """Points sorted at a time, so that their intermediate values stay in the nearest cache."""
 
 
-class CellTable(NamedTuple):
-    """Extremes and numbers of the points of each cell.
-
-    Attributes
-    ----------
-    extremes : (M * n_bins + 1, 5) float32 or float64
-        Height of the lowest point, its range, height of the highest point, x and y of the lowest
-        point [m]. The last row is for points in no cell.
-    numbers : (M * n_bins + 1, 2) int32
-        Number of points; tile of the lowest point.
-    """
-
-    extremes: PointArray
-    numbers: CellArray
-
-
-class TileTable(NamedTuple):
-    """The arrays of `Tiles`, with room for more tiles.
-
-    Attributes
-    ----------
-    extremes : (capacity, 2) float32 or float64
-        Heights of the lowest and the highest point of each tile [m].
-    place : (capacity,) int32
-        Place of each tile.
-    at : (n_sides^2,) int32
-        Tile at each place, or `OUTSIDE`.
-    number : (1,) int64
-        How many tiles there are. Code that fills the table first empties their places, a tenth
-        of all.
-    """
-
-    extremes: PointArray
-    place: CellArray
-    at: CellArray
-    number: IntArray
-
-    @classmethod
-    def empty(cls, n_places: int, capacity: int, dtype: npt.DTypeLike) -> TileTable:
-        """Table without a tile."""
-        return cls(
-            np.empty((capacity, 2), dtype=dtype),
-            np.empty(capacity, np.int32),
-            np.full(n_places, OUTSIDE, np.int32),
-            np.zeros(1, np.int64),
-        )
-
-
-class Places(NamedTuple):
-    """Cell, range [m] and tile of each point; see `PolarGrid` and `Tiles`."""
-
-    cell: CellArray
-    r: PointArray
-    tile: CellArray
-
-
 @jit(entry=True)
 def build_grid(
     columns: PointArray,
     geometry: GridGeometry,
     min_extent: float,
-    places: Places,
-    cells: CellTable,
-    tiles: TileTable,
+    grid: PolarGrid,
+    tiles: Tiles,
     candidates: Candidates,
-) -> int:
+) -> tuple[int, int]:
     """Sort points, (3, N), into cells and tiles, with the extremes of each.
 
     Block by block: first the places of the points, in loops without branches; then the
-    extremes. Returns the number of candidates, see `_take_candidates`.
+    extremes. Returns the numbers of tiles and of candidates, which have room for more; see
+    `_take_candidates`.
     """
-    cell, r, tile = places.cell, places.r, places.tile
-    extremes, numbers = cells.extremes, cells.numbers
-    _clear(extremes, numbers, tiles)
+    cell, r, tile, at = grid.cell, grid.r, tiles.tile, tiles.at
+    n_cells, n_tiles = (len(candidates.offsets) - 1) * (len(geometry.edges) - 1), 0
+    # Of each cell: height of the lowest point, its range, height of the highest point, x and y of
+    # the lowest point; number of points, and tile of the lowest. The last is for those in no cell.
+    extremes, numbers = np.empty((n_cells + 1, 5), r.dtype), np.empty((n_cells + 1, 2), np.int32)
+    for k in range(n_cells + 1):
+        extremes[k, 0] = extremes[k, 1] = np.inf
+        extremes[k, 2] = -np.inf
+        numbers[k, 0], numbers[k, 1] = 0, OUTSIDE
+    for k in range(len(at)):
+        at[k] = OUTSIDE
     range_entry, place = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
     key, key_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, np.int32)
     for first in range(0, len(r), BLOCK):
@@ -111,24 +62,12 @@ def build_grid(
         _compute_range(x, y, z, geometry.ranges, r[block], range_entry, cell[block])
         _compute_azimuth_key(x, y, geometry, cell[block], key, key_entry, place)
         _look_up(geometry, r[block], range_entry, key, key_entry, cell[block])
-        _widen(z, cell[block], place, tile[block], extremes, numbers, tiles)
+        n_tiles = _widen(z, cell[block], place, tile[block], extremes, numbers, tiles, n_tiles)
     for first in range(0, len(r), BLOCK):
         block = slice(first, min(first + BLOCK, len(r)))
         own = columns[:, block], r[block], cell[block], tile[block]
         _resolve_lowest(*own, tiles.place, extremes, numbers)
-    return _take_candidates(cells, geometry.edges, min_extent, candidates)
-
-
-@jit(part=True)
-def _clear(extremes: PointArray, numbers: CellArray, tiles: TileTable) -> None:
-    """Make the tables those of no points."""
-    for k in range(len(numbers)):
-        extremes[k, 0] = extremes[k, 1] = np.inf
-        extremes[k, 2] = -np.inf
-        numbers[k, 0], numbers[k, 1] = 0, OUTSIDE
-    for t in range(tiles.number[0]):
-        tiles.at[np.uintp(tiles.place[t])] = OUTSIDE
-    tiles.number[0] = 0
+    return n_tiles, _take_candidates(extremes, numbers, geometry.edges, min_extent, candidates)
 
 
 @jit()
@@ -214,13 +153,14 @@ def _widen(
     tile: CellArray,
     extremes: PointArray,
     numbers: CellArray,
-    tiles: TileTable,
-) -> None:
+    tiles: Tiles,
+    n_tiles: int,
+) -> int:
     """Heights and number of the points of each cell and tile; tile of each point.
 
-    Numbers the tiles in the order of their first points.
+    Numbers the tiles in the order of their first points; returns how many there are now.
     """
-    tile_extremes, at, n_tiles = tiles.extremes, tiles.at, tiles.number[0]
+    tile_extremes, at = tiles.extremes, tiles.at
     for i in range(len(z)):
         k = np.uintp(cell[i] if cell[i] >= 0 else len(numbers) - 1)
         low, high = extremes[k, 0], extremes[k, 2]
@@ -241,7 +181,7 @@ def _widen(
         low, high = tile_extremes[k, 0], tile_extremes[k, 1]
         tile_extremes[k, 0] = z[i] if z[i] < low else low
         tile_extremes[k, 1] = z[i] if z[i] > high else high
-    tiles.number[0] = n_tiles
+    return n_tiles
 
 
 @jit()
@@ -282,14 +222,18 @@ def _resolve_lowest(
 
 @jit()
 def _take_candidates(
-    cells: CellTable, edges: FloatArray, min_extent: float, candidates: Candidates
+    extremes: PointArray,
+    numbers: CellArray,
+    edges: FloatArray,
+    min_extent: float,
+    candidates: Candidates,
 ) -> int:
     """Take the lowest point of each cell, into arrays with room for all cells.
 
     Returns the number of candidates. `edges` and `min_extent` are those of `ground_candidates`
     of the twin.
     """
-    extremes, numbers, n_bins = cells.extremes, cells.numbers, len(edges) - 1
+    n_bins = len(edges) - 1
     c = 0
     for m in range(len(candidates.offsets) - 1):
         candidates.offsets[m] = c

@@ -76,7 +76,7 @@ def estimate_surface(
     knot_log_length_scale : (M, K) float64
         At the knots [log m].
     log_length_scale : (C,) float64
-        At the candidates [log m]; may lie in a buffer that the next call reuses.
+        At the candidates [log m].
     """
     candidates, knots, slope_std = frame.candidates, frame.knots, config.observation.slope_std
     if config.length_scale.model == 'latent':
