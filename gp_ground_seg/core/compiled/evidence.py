@@ -52,14 +52,12 @@ def estimate_surface(
     odds = _find_seeds(frame, theta, growth, max_slope, own[0], by_itself.seed)
     odds = odds if by_roughness else 0.0
     from_neighbours = nothing
-    # Variables, as numba compiles a function anew for each constant that it is called with.
-    some, every = STEP, 1
     if looks_aside:
         by_itself.mean[:], by_itself.std[:] = math.nan, math.nan
-        grow_surfaces(frame, theta, observation, growth, odds, nothing, some, by_itself)
+        grow_surfaces(frame, theta, observation, growth, odds, nothing, STEP, by_itself)
         _find_evidence(by_itself, theta, knots, slope_std, own, table)
         from_neighbours = table
-    grow_surfaces(frame, theta, observation, growth, odds, from_neighbours, every, by_itself)
+    grow_surfaces(frame, theta, observation, growth, odds, from_neighbours, 1, by_itself)
     if looks_aside:
         _find_evidence(by_itself, theta, knots, slope_std, own, table)
     _combine(by_itself, from_neighbours, theta, knots, slope_std, frame.prior_mean, mean, std)
