@@ -378,10 +378,9 @@ def warm_up(config: Config | None = None) -> Backend:
 def keep_freed_memory() -> None:
     """Have the process keep the memory of a frame for the next one.
 
-    What a frame frees, glibc gives back to the system, which maps and clears each page anew for
-    the next: 2 ms of a frame, 9 ms of one in numpy. From the largest block freed so far, up to
-    32 MB, glibc takes how much to keep (mallopt(3), M_MMAP_THRESHOLD); the pages of this block are
-    never touched.
+    What a frame frees, glibc gives back to the system, which maps and clears thousands of pages
+    anew for the next, 1 to 2 us each. How much it keeps follows from the largest block freed so
+    far, up to 32 MB (mallopt(3), M_MMAP_THRESHOLD); the pages of this one are never touched.
     """
     np.empty(LARGEST_KEPT, np.uint8)
 

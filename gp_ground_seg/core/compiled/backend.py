@@ -37,7 +37,7 @@ from gp_ground_seg.core.jit import announce_compiling, keep_code
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.number_tuples import numbers_of
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.core.pipeline.labels import depth_of_ground, sum_units
+from gp_ground_seg.core.pipeline.labels import depth_of_ground, lowest_of, sum_units
 from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import Direction, in_columns
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
@@ -173,6 +173,7 @@ class NumbaBackend:
             numbers_of(config.label),
             depth_of_ground(config.label),
             sum_units(n_points),
+            lowest_of(surface),
             config.label.rule == 'roughness',
             result,
         )

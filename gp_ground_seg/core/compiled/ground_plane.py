@@ -18,11 +18,9 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     GroundPlane,
     LowestPoints,
     Moments,
-    NumbersOfPlane,
     Plane,
     crossed_at,
     distance,
-    fit_cells,
     levelness,
     refutation_by,
     segment_directions,
@@ -45,40 +43,22 @@ _PER_METRE = 4.0 / float(RING_EDGES[1] - RING_EDGES[0])
 _STARTS = RING_EDGES[0] + (np.arange(int(RING_EDGES[-1] * _PER_METRE) + 1) - 0.02) / _PER_METRE
 _RING_TABLE = np.clip(np.searchsorted(RING_EDGES, _STARTS, side='right') - 1, 0, N_RINGS - 1)
 
+_fit_cells = jit(entry=True)(ground_plane.fit_cells)
+
 
 def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> GroundPlane | None:
     """Do what `gp_ground_seg.core.pipeline.ground_plane.fit_plane` does, to rounding."""
     directions = segment_directions(len(candidates.offsets) - 1)
-    numbers = _fit(candidates, directions, max_slope, origin)
+    x, y, z, r, tolerance, inverse, weight, lowest_z = np.empty((8, N_LARGEST))
+    number = np.empty(N_LARGEST, dtype=np.int64)
+    cells = LowestPoints(x, y, z, r, tolerance, inverse, weight, number, lowest_z)
+    n = _tabulate(candidates, directions, cells)
+    cells = LowestPoints._make(column[: -(-n // WIDTH) * WIDTH] for column in cells)
+    numbers = _fit_cells(cells, n, max_slope, origin)
     return GroundPlane(*numbers) if numbers[-1] > 0 else None
 
 
 @jit(entry=True)
-def _fit(
-    candidates: Candidates, directions: FloatArray, max_slope: float, origin: Direction
-) -> NumbersOfPlane:
-    """Tabulate the lowest points, and fit a plane to them."""
-    table, number = np.empty((8, N_LARGEST)), np.empty(N_LARGEST, np.int64)
-    cells = LowestPoints(
-        table[0], table[1], table[2], table[3], table[4], table[5], table[6], number, table[7]
-    )
-    n = _tabulate(candidates, directions, cells)
-    size = -(-n // WIDTH) * WIDTH
-    cells = LowestPoints(
-        cells.x[:size],
-        cells.y[:size],
-        cells.z[:size],
-        cells.r[:size],
-        cells.tolerance[:size],
-        cells.inverse[:size],
-        cells.weight[:size],
-        cells.cell[:size],
-        cells.lowest_z[:size],
-    )
-    return fit_cells(cells, n, max_slope, origin)
-
-
-@jit()
 def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoints) -> int:
     """Set the lowest points, and those behind them to count for nothing; return their number."""
     offsets, r, z = candidates.offsets, candidates.r, candidates.z

@@ -59,13 +59,14 @@ def label_points(
     config: LabelConfig,
     depth: float,
     units: float,
+    lowest: float,
     by_roughness: bool,
     result: Labelled,
 ) -> None:
     """Height, label and margin of each point, into `result`.
 
-    `is_level` says whether the relief is level; `depth` and `units` are those of `depth_of_ground`
-    and `sum_units`, and `by_roughness` is the rule of the parameters.
+    `is_level` says whether the relief is level; `depth`, `units` and `lowest` are those of
+    `depth_of_ground`, `sum_units` and `lowest_of`; `by_roughness` is the rule of the parameters.
     """
     tiles, n_tiles = scan.tiles, len(scan.tiles.place)
     sums, bands = np.zeros((n_tiles + 1, 2), np.int64), np.zeros(n_tiles + 1)
@@ -78,16 +79,7 @@ def label_points(
         bands[t] = ground_band(bands[t], config)
     _label_by_bands(scan, faces, config, depth, bands, has_obstacle, result)
     if by_roughness:
-        _vote(scan, _lowest_of(surface), has_obstacle, config, result)
-
-
-@jit()
-def _lowest_of(surface: GroundSurface) -> float:
-    """Lowest height of the surface [m], from which layers of votes are counted."""
-    lowest = math.nan
-    for height in surface.mean.reshape(-1):
-        lowest = lowest if height >= lowest or math.isnan(height) else height
-    return lowest
+        _vote(scan, lowest, has_obstacle, config, result)
 
 
 @jit()
@@ -194,7 +186,7 @@ def _label_by_bands(
         margins[i] = margin
         if margin < 0.0 and is_near(height[i]):
             has_obstacle[t] = True
-    # By itself, as it has no branch.
+    # A loop of its own: without a branch it has vector instructions.
     for i in range(len(cell)):
         otherwise = _UNKNOWN if cell[i] == NOT_FINITE else _OBSTACLE
         label[i] = _GROUND if margins[i] >= 0.0 else otherwise

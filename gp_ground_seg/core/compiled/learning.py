@@ -21,7 +21,7 @@ from gp_ground_seg.core.gp.learning import (
     missed_by_line,
     slope_of_prior,
 )
-from gp_ground_seg.core.gp.search import Search, begin, propose, take_outcome
+from gp_ground_seg.core.gp.search import Search, begin, propose, search_from, take_outcome
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, LearningConfig, ObservationConfig
 
@@ -52,17 +52,7 @@ def learn_frame(
     for i in range(2, len(theta)):
         has_latent |= space.free[i]
     outcome[0], outcome[1] = -math.inf, BUDGET
-    d, places = len(theta), np.empty((6, len(theta)))
-    search = Search(
-        places[0],
-        places[1],
-        places[2],
-        places[3],
-        places[4],
-        places[5],
-        np.empty((d, d)),
-        np.empty(2),
-    )
+    search = search_from(theta, space.lower.copy(), space.upper.copy())
     n_rounds = n_before = n_evaluations = 0
     budget = max(learning.max_evaluations // 2, 1)
     while budget > 0:

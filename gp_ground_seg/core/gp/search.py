@@ -41,11 +41,12 @@ class Search(NamedTuple):
     value: FloatArray  # (2,) at the best place; factor on the next step
 
 
+@shared
 def search_from(x: FloatArray, lower: FloatArray, upper: FloatArray) -> Search:
     """Begin at `x`, within the bounds: the first trial."""
-    d = len(x)
-    at, gradient, trial, turned = np.empty((4, d))
-    search = Search(lower, upper, at, gradient, trial, turned, np.empty((d, d)), np.empty(2))
+    d, room = len(x), np.empty((4, len(x)))
+    places = room[0], room[1], room[2], room[3]
+    search = Search(lower, upper, *places, np.empty((d, d)), np.empty(2))
     begin(search, x)
     return search
 

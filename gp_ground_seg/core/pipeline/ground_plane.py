@@ -215,7 +215,6 @@ def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> Gr
 
 
 @shared
-@shared
 def fit_cells(cells: LowestPoints, n: int, max_slope: float, origin: Direction) -> NumbersOfPlane:
     """Fit a plane to the first `n` points; its last number is 0 if there is none."""
     is_found, best = False, (0.0, 0.0, 0.0)
