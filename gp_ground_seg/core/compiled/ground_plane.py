@@ -75,23 +75,24 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
     for cell in range(N_CELLS):
         starts[cell + 1] += starts[cell]
     # Candidates cell by cell, in order of their segments.
-    members, homes = np.empty(starts[N_CELLS], np.int64), np.empty(starts[N_CELLS], np.int64)
-    ends = np.empty(N_CELLS, np.int64)
-    for cell in range(N_CELLS):
-        ends[cell] = starts[cell]
+    n, ends, home = starts[N_CELLS], starts[:N_CELLS].copy(), np.empty(starts[N_CELLS], np.int64)
+    near_r, near_z = np.empty(n), np.empty(n)
     for m in range(n_segments):
         for c in range(offsets[m], offsets[m + 1]):
             if cell_of[c] >= 0:
-                members[ends[cell_of[c]]], homes[ends[cell_of[c]]] = c, m
+                k = ends[cell_of[c]]
+                near_r[k], near_z[k], home[k] = r[c], z[c], m
                 ends[cell_of[c]] += 1
     n = 0
     for cell in range(N_CELLS):
         if starts[cell] < ends[cell]:
-            lowest, k = _lowest(members, starts[cell], ends[cell], r, z)
-            cells.lowest_z[n] = z[members[lowest]]
-            range_, height, m = r[members[k]], z[members[k]], homes[k]
+            first, end = starts[cell], ends[cell]
+            _sort(near_r[first:end], near_z[first:end], home[first:end])
+            k = _lowest_together(near_r, near_z, first, end)
+            cells.lowest_z[n] = near_z[first]
+            range_, m = near_r[k], home[k]
             cells.x[n], cells.y[n] = range_ * directions[0, m], range_ * directions[1, m]
-            cells.z[n], cells.r[n] = height, range_
+            cells.z[n], cells.r[n] = near_z[k], range_
             cells.tolerance[n] = tolerance_at(range_)
             cells.inverse[n] = 1.0 / cells.tolerance[n]
             cells.weight[n], cells.cell[n] = weight_at(range_), cell
@@ -103,36 +104,27 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
 
 
 @jit()
-def _lowest(
-    members: IntArray, start: int, end: int, r: FloatArray, z: FloatArray
-) -> tuple[int, int]:
-    """Which of the members from `start` to `end` is the lowest, and the lowest not by itself."""
-    lowest = last = -1
-    for _ in range(end - start):
-        best = -1
-        for k in range(start, end):
-            is_next = last < 0 or _is_before(members[last], members[k], r, z)
-            if is_next and (best < 0 or _is_before(members[k], members[best], r, z)):
-                best = k
-        if lowest < 0:
-            lowest = best
-        n_above, c = 0, members[best]
-        for k in range(start, end):
-            if _is_before(c, members[k], r, z) and z[members[k]] - z[c] <= tolerance_at(r[c]):
-                n_above += 1
-        if n_above >= N_TOGETHER - 1:
-            return lowest, best
-        last = best
-    return lowest, lowest
+def _sort(r: FloatArray, z: FloatArray, home: IntArray) -> None:
+    """Sort the candidates of a cell by height, equally high ones by range, in place: few."""
+    for k in range(1, len(z)):
+        r_k, z_k, home_k, place = r[k], z[k], home[k], k
+        while place > 0:
+            before = np.uintp(place - 1)
+            if z[before] < z_k or (z[before] == z_k and r[before] <= r_k):
+                break
+            at = np.uintp(place)
+            r[at], z[at], home[at] = r[before], z[before], home[before]
+            place -= 1
+        r[place], z[place], home[place] = r_k, z_k, home_k
 
 
 @jit()
-def _is_before(a: int, b: int, r: FloatArray, z: FloatArray) -> bool:
-    """Whether candidate `a` is the lower one, of equally low ones the nearer, then the first."""
-    if z[a] != z[b]:
-        is_lower: bool = z[a] < z[b]
-        return is_lower
-    return r[a] < r[b] or (r[a] == r[b] and a < b)
+def _lowest_together(r: FloatArray, z: FloatArray, first: int, end: int) -> int:
+    """Lowest of the sorted candidates from `first` to `end` that is not by itself, or the first."""
+    for k in range(first, end - N_TOGETHER + 1):
+        if z[k + N_TOGETHER - 1] - z[k] <= tolerance_at(r[k]):
+            return k
+    return first
 
 
 @compiled_form(ground_plane.supports_of)
