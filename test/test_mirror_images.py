@@ -8,8 +8,9 @@ from conftest import simulated
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
-from gp_ground_seg.core.frame import Label
-from gp_ground_seg.core.pipeline.mirror_images import DEEP, find_mirror_images
+from gp_ground_seg.core.compiled.backend import NumbaBackend
+from gp_ground_seg.core.frame import Candidates, Label
+from gp_ground_seg.core.pipeline.mirror_images import DEEP, find_mirror_images, is_wet
 from gp_ground_seg.lab.simulation import SENSORS
 
 WET = [('hdl-64e', 0), ('vlp-16', 1), ('os1-128', 2)]
@@ -21,7 +22,7 @@ def images_in(points, sensor):
     config = dataclasses.replace(Config(), sensor=sensor)
     pose = GroundSegmenter(config).segment(points).pose
     scan = NumpyBackend().build_grid(pose.level(np.ascontiguousarray(points[:, :3])), config)
-    found = find_mirror_images(scan, pose, sensor)
+    found = find_mirror_images(scan, pose, sensor, is_wet)
     is_image = np.zeros(len(points), dtype=bool)
     is_image[found.points] = True
     return is_image, found
@@ -83,3 +84,17 @@ def test_images_are_told_by_where_rays_start():
     assert not images_in(lifted, Config().sensor)[0].any()
     aside = Config().replace(**{'sensor.origin_x': 0.5}).sensor
     assert not images_in(points, aside)[0].any()
+
+
+def test_backends_agree_on_which_road_is_wet():
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(300):
+        number = rng.integers(0, 30, size=6)
+        candidates = Candidates.buffers(number.sum(), len(number))
+        candidates.offsets[:] = np.append(0, np.cumsum(number))
+        candidates.r[:] = np.concatenate([np.sort(rng.uniform(0.2, 25.0, n)) for n in number])
+        candidates.z[:] = -1.7 + rng.normal(0.0, rng.choice([0.02, 0.3], number.sum()))
+        found.append(NumpyBackend().is_wet(candidates, -1.7, 0.1))
+        assert NumbaBackend().is_wet(candidates, -1.7, 0.1) == found[-1]
+    assert 30 < sum(found) < 270

@@ -27,6 +27,7 @@ from gp_ground_seg.core.pipeline import (
     ground_plane,
     labels,
     lines,
+    mirror_images,
     polar_grid,
     relief,
     vertical_faces,
@@ -55,6 +56,9 @@ class Backend(Protocol):
         self, candidates: Candidates, max_slope: float, origin: Direction
     ) -> ground_plane.GroundPlane | None:
         """See `gp_ground_seg.core.pipeline.ground_plane.fit_plane`."""
+
+    def is_wet(self, candidates: Candidates, plane_z: float, sensor_z: float) -> bool:
+        """See `gp_ground_seg.core.pipeline.mirror_images.is_wet`."""
 
     def find_faces(self, scan: Scan, config: Config) -> Faces:
         """See `gp_ground_seg.core.pipeline.vertical_faces.find_faces`."""
@@ -89,6 +93,7 @@ class NumpyBackend:
     name = 'numpy'
     build_grid = staticmethod(polar_grid.build_scan)
     fit_plane = staticmethod(ground_plane.fit_plane)
+    is_wet = staticmethod(mirror_images.is_wet)
     find_faces = staticmethod(vertical_faces.find_faces)
     find_relief = staticmethod(relief.find_relief)
     extract_lines = staticmethod(lines.find_lines)

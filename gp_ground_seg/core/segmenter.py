@@ -283,7 +283,7 @@ class GroundSegmenter:
             pose = with_fallback(pose, fallback, sensor)
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
             scan = backend.build_grid(pose.level(xyz), config)
-        images = find_mirror_images(scan, pose, sensor)
+        images = find_mirror_images(scan, pose, sensor, backend.is_wet)
         if len(images.points) > 0:
             scan = images.left_out(backend.build_grid(images.raised(scan.xyz), config))
         timer.mark('pose')

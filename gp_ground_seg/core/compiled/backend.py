@@ -75,6 +75,10 @@ class NumbaBackend:
         """Plane of the ground around the sensor."""
         return ground_plane.fit_plane(candidates, max_slope, origin)
 
+    def is_wet(self, candidates: Candidates, plane_z: float, sensor_z: float) -> bool:
+        """Whether many candidates are mirror images on a wet road."""
+        return bool(ground_plane.is_wet(candidates, plane_z, sensor_z))
+
     def find_faces(self, scan: Scan, config: Config) -> Faces:
         """Tiles that hold a vertical face."""
         result = Faces.none(scan.tiles)

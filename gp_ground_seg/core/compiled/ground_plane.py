@@ -1,4 +1,4 @@
-"""Loops of `gp_ground_seg.core.pipeline.ground_plane` for compiled code."""
+"""Loops of `gp_ground_seg.core.pipeline.ground_plane`, and a wet road, for compiled code."""
 
 from __future__ import annotations
 
@@ -29,6 +29,15 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     tukey_weight,
     weight_at,
 )
+from gp_ground_seg.core.pipeline.mirror_images import (
+    BELOW_SIGHT,
+    NEAREST,
+    WET_REACH,
+    WET_SHARE,
+    is_image,
+    is_on_plane,
+    slope_of_sight,
+)
 from gp_ground_seg.core.pipeline.points import Direction
 
 WIDTH = 32
@@ -56,6 +65,22 @@ def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> Gr
     cells = LowestPoints._make(column[: -(-n // WIDTH) * WIDTH] for column in cells)
     numbers = _fit_cells(cells, n, max_slope, origin)
     return GroundPlane(*numbers) if numbers[-1] > 0 else None
+
+
+@jit(entry=True)
+def is_wet(candidates: Candidates, plane_z: float, sensor_z: float) -> bool:
+    """Do what `gp_ground_seg.core.pipeline.mirror_images.is_wet` does."""
+    n_images = n_ground = 0
+    for m in range(len(candidates.offsets) - 1):
+        nearer = -np.inf
+        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            r, z = candidates.r[c], candidates.z[c]
+            if NEAREST <= r < WET_REACH:
+                slope = slope_of_sight(r, z, sensor_z)
+                n_images += is_image(r, z, slope, nearer, plane_z, sensor_z, BELOW_SIGHT)
+                if is_on_plane(r, z, plane_z):
+                    n_ground, nearer = n_ground + 1, max(nearer, slope)
+    return n_images > WET_SHARE * n_ground
 
 
 @jit(entry=True)
@@ -120,7 +145,7 @@ def _sort(r: FloatArray, z: FloatArray, home: IntArray) -> None:
 
 @jit()
 def _lowest_together(r: FloatArray, z: FloatArray, first: int, end: int) -> int:
-    """Lowest of the sorted candidates from `first` to `end` that is not by itself, or the first."""
+    """Lowest of the sorted ones from `first` to `end` that is not by itself, or the first."""
     for k in range(first, end - N_TOGETHER + 1):
         if z[k + N_TOGETHER - 1] - z[k] <= tolerance_at(r[k]):
             return k

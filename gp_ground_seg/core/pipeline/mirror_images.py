@@ -8,11 +8,21 @@ above it. Images that are raised again to what they are images of are no ground.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, PointArray, Scan
+from gp_ground_seg.core.frame import (
+    BoolArray,
+    Candidates,
+    FloatArray,
+    IntArray,
+    PointArray,
+    Scan,
+    Values,
+)
+from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import SensorConfig
 from gp_ground_seg.core.pipeline.ground_plane import tolerance_at
 from gp_ground_seg.core.pipeline.low_sensor import is_seen_from_sensor
@@ -34,6 +44,7 @@ N_ASIDE = 4
 WET_SHARE, WET_REACH = 0.1, 20.0
 """Images among the candidates for each on the plane, both up to this range [m], from which a road
 is wet: of dry scans the most was 0.07, of wet ones the least 0.14."""
+IsWet = Callable[[Candidates, float, float], bool]
 
 
 class MirrorImages(NamedTuple):
@@ -57,44 +68,76 @@ class MirrorImages(NamedTuple):
         return scan._replace(candidates=candidates.where(~is_image))
 
 
-def find_mirror_images(scan: Scan, pose: SensorPose, sensor: SensorConfig) -> MirrorImages:
+def find_mirror_images(
+    scan: Scan, pose: SensorPose, sensor: SensorConfig, is_wet: IsWet
+) -> MirrorImages:
     """Find the mirror images of a scan in the level frame: none unless the road is wet.
 
     Where rays start must be known: at the origin of the cloud, or above or below it at that of the
-    parameters. Else there are none.
+    parameters, and above the plane. Else there are none. `is_wet` is that of this module, or
+    compiled.
     """
     none = MirrorImages(np.zeros(0, dtype=np.int64), np.zeros(0))
     x, y, up = (pose.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)).tolist()
     if not is_seen_from_sensor(pose) or (x, y) != (0.0, 0.0):
         return none
-    candidates, grid, heights = scan.candidates, scan.grid, (-pose.height, up)
-    r, z = candidates.r, candidates.z
-    is_near = (r >= NEAREST) & (r < WET_REACH)
-    is_ground = is_near & (np.abs(z + pose.height) <= tolerance_at(r))
-    most_if_dry = WET_SHARE * np.count_nonzero(is_ground)
-    # Most scans end here: even if all that is deep were an image, the road would be dry.
-    if np.count_nonzero(is_near & (z < -pose.height - DEEP)) <= most_if_dry:
-        return none
-    r, z, is_ground = r[is_near], z[is_near], is_ground[is_near]
-    slope = _slope(r, z, up)
-    nearer = _nearer_in_segment(slope, is_ground, candidates.segment[is_near])
-    found = _is_image(r, z, slope, nearer, heights, BELOW_SIGHT)
-    if np.count_nonzero(found) <= most_if_dry:
+    grid, plane_z = scan.grid, -pose.height
+    if not (up > plane_z and is_wet(scan.candidates, plane_z, up)):
         return none
     inside = np.flatnonzero(grid.inside)
     r, z = grid.r[inside].astype(np.float64), scan.xyz[inside, 2].astype(np.float64)
-    slope, cell = _slope(r, z, up), grid.cell[inside].astype(np.int64)
-    is_ground = np.abs(z + pose.height) <= tolerance_at(r)
-    is_ground &= (r >= NEAREST) & (r < GROUND_REACH)
+    slope, cell = slope_of_sight(r, z, up), grid.cell[inside].astype(np.int64)
+    is_ground = (r < GROUND_REACH) & is_on_plane(r, z, plane_z)
     nearer = _nearer_about(slope[is_ground], cell[is_ground], (grid.n_segments, grid.n_bins))[cell]
-    found = _is_image(r, z, slope, nearer, heights, -OVER_SIGHT)
+    found = is_image(r, z, slope, nearer, plane_z, up, -OVER_SIGHT)
     return MirrorImages(inside[found], -2.0 * (z[found] + pose.height))
 
 
-def _slope(r: FloatArray, z: FloatArray, sensor_z: float) -> FloatArray:
-    """Slopes of the lines of sight to returns (P,) at a range and a height [m]."""
-    result: FloatArray = (z - sensor_z) / np.maximum(r, NEAREST)
-    return result
+def is_wet(candidates: Candidates, plane_z: float, sensor_z: float) -> bool:
+    """Whether many candidates are images; heights are those of the ground and the sensor [m]."""
+    near = np.flatnonzero((candidates.r >= NEAREST) & (candidates.r < WET_REACH))
+    r, z = candidates.r[near], candidates.z[near]
+    is_ground = is_on_plane(r, z, plane_z)
+    most_if_dry = WET_SHARE * np.count_nonzero(is_ground)
+    # Most scans end here: even if all that is deep were an image, the road would be dry.
+    if np.count_nonzero(z < plane_z - DEEP) <= most_if_dry:
+        return False
+    slope = slope_of_sight(r, z, sensor_z)
+    nearer = _nearer_in_segment(slope, is_ground, candidates.segment[near])
+    found = is_image(r, z, slope, nearer, plane_z, sensor_z, BELOW_SIGHT)
+    return bool(np.count_nonzero(found) > most_if_dry)
+
+
+@shared
+def is_on_plane(r: Values, z: Values, plane_z: float) -> Values:
+    """Whether returns are of the ground that tells images."""
+    return (r >= NEAREST) & (np.abs(z - plane_z) <= tolerance_at(r))
+
+
+@shared
+def slope_of_sight(r: Values, z: Values, sensor_z: float) -> Values:
+    """Slope of the line of sight to a return at a range and a height [m]."""
+    return (z - sensor_z) / np.maximum(r, NEAREST)
+
+
+@shared
+def is_image(
+    r: Values,
+    z: Values,
+    slope: Values,
+    nearer: Values,
+    plane_z: float,
+    sensor_z: float,
+    least: float,
+) -> Values:
+    """Whether a return is deep, and `least` below the line of sight to ground that is nearer.
+
+    `slope` and `nearer` are the slopes of the lines of sight to it and to that ground, -inf where
+    there is none; `least` is measured at the plane [m].
+    """
+    # Only a line of sight that points down meets the plane: at its height over its slope.
+    may_be = (z < plane_z - DEEP) & (r >= NEAREST) & (r < IMAGE_REACH) & (nearer < 0.0)
+    return may_be & ((nearer - slope) * (sensor_z - plane_z) > -least * nearer)
 
 
 def _nearer_in_segment(slope: FloatArray, is_ground: BoolArray, segment: IntArray) -> FloatArray:
@@ -126,26 +169,3 @@ def _nearer_about(slope: FloatArray, cell: IntArray, shape: tuple[int, int]) -> 
     before: FloatArray = np.full(shape, -np.inf)
     np.maximum.accumulate(highest[:, :-1], axis=1, out=before[:, 1:])
     return before.reshape(-1)
-
-
-def _is_image(
-    r: FloatArray,
-    z: FloatArray,
-    slope: FloatArray,
-    nearer: FloatArray,
-    heights: tuple[float, float],
-    least: float,
-) -> BoolArray:
-    """Whether returns (P,) are deep, and `least` below the line of sight to ground that is nearer.
-
-    `slope` and `nearer` are those of the lines of sight to each and to that ground, `heights`
-    those of the plane of the ground and of the sensor, and `least` is measured there [m].
-    """
-    plane_z, sensor_z = heights
-    # Only a line of sight that points down meets the plane: at its height over its slope.
-    may_be = (z < plane_z - DEEP) & (r >= NEAREST) & (r < IMAGE_REACH) & (nearer < 0.0)
-    chosen = np.flatnonzero(may_be & (nearer > -np.inf))
-    below = (nearer[chosen] - slope[chosen]) * (sensor_z - plane_z)
-    result = np.zeros(len(z), dtype=np.bool_)
-    result[chosen[below > -least * nearer[chosen]]] = True
-    return result
