@@ -112,7 +112,7 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
     for cell in range(N_CELLS):
         if starts[cell] < ends[cell]:
             first, end = starts[cell], ends[cell]
-            _sort(near_r[first:end], near_z[first:end], home[first:end])
+            _sort(near_r, near_z, home, first, end)
             k = _lowest_together(near_r, near_z, first, end)
             cells.lowest_z[n] = near_z[first]
             range_, m = near_r[k], home[k]
@@ -129,17 +129,16 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
 
 
 @jit()
-def _sort(r: FloatArray, z: FloatArray, home: IntArray) -> None:
-    """Sort the candidates of a cell by height, equally high ones by range, in place: few."""
-    for k in range(1, len(z)):
-        r_k, z_k, home_k, place = r[k], z[k], home[k], k
-        while place > 0:
-            before = np.uintp(place - 1)
+def _sort(r: FloatArray, z: FloatArray, home: IntArray, first: int, end: int) -> None:
+    """Sort the candidates from `first` to `end` by height, then by range, in place: few."""
+    for k in range(first + 1, end):
+        r_k, z_k, home_k, place = r[k], z[k], home[k], np.uintp(k)
+        while place > first:
+            before = place - np.uintp(1)
             if z[before] < z_k or (z[before] == z_k and r[before] <= r_k):
                 break
-            at = np.uintp(place)
-            r[at], z[at], home[at] = r[before], z[before], home[before]
-            place -= 1
+            r[place], z[place], home[place] = r[before], z[before], home[before]
+            place = before
         r[place], z[place], home[place] = r_k, z_k, home_k
 
 

@@ -64,6 +64,8 @@ exp_neg_single = _make_exp_neg(np.float32, 4, NEGLIGIBLE_SINGLE)
 compiled_form(kernels.exp_neg, single=exp_neg_single)(exp_neg)
 
 
+# Below, elements are taken by two unsigned indices: of a view of a row, references are counted,
+# which takes longer than a short row; a signed index could count from the end.
 @jit()
 def solve_in_place(matrix: FloatArray, n: int, vector: FloatArray) -> bool:
     """Replace `vector` by the solution of ``A x = vector``; False if not positive definite.
@@ -71,66 +73,61 @@ def solve_in_place(matrix: FloatArray, n: int, vector: FloatArray) -> bool:
     `matrix` holds the upper triangle of A, in rows of whole vectors. Values left of the
     diagonal and behind column n are arbitrary. Gaussian elimination.
     """
-    end = (n + LANES - 1) & -LANES
-    for k in range(n):
-        row = matrix[k]
+    end, stop, one = np.uintp((n + LANES - 1) & -LANES), np.uintp(n), np.uintp(1)
+    for k in range(stop):
         # Written so that NaN fails too.
-        if not row[k] > 0.0:
+        if not matrix[k, k] > 0.0:
             return False
-        inverse = 1.0 / row[k]
-        for i in range(k + 1, n):
-            factor = row[i] * inverse
-            below = matrix[i]
-            for j in range(i & -LANES, end):
-                below[j] -= factor * row[j]
+        inverse = 1.0 / matrix[k, k]
+        for i in range(k + one, stop):
+            factor = matrix[k, i] * inverse
+            for j in range(i & ~np.uintp(LANES - 1), end):
+                matrix[i, j] -= factor * matrix[k, j]
             vector[i] -= factor * vector[k]
-        row[k] = inverse
+        matrix[k, k] = inverse
     for k in range(n - 1, -1, -1):
-        row = matrix[k]
         value = vector[k]
-        for j in range(k + 1, n):
-            value -= row[j] * vector[j]
-        vector[k] = value * row[k]
+        for j in range(np.uintp(k + 1), stop):
+            value -= matrix[k, j] * vector[j]
+        vector[k] = value * matrix[k, k]
     return True
 
 
 @jit()
 def factorise(a: FloatArray, n: int) -> bool:
     """Replace the upper triangle of ``a[:n, :n]`` by U, ``A = U^T U``; False if not possible."""
-    for k in range(n):
-        row = a[k]
+    stop, one = np.uintp(n), np.uintp(1)
+    for k in range(stop):
         # Written so that NaN fails too.
-        if not row[k] > 0.0:
+        if not a[k, k] > 0.0:
             return False
-        pivot = math.sqrt(row[k])
-        row[k] = pivot
+        pivot = math.sqrt(a[k, k])
+        a[k, k] = pivot
         scale = 1.0 / pivot
-        for j in range(k + 1, n):
-            row[j] *= scale
-        for i in range(k + 1, n):
-            weight = row[i]
-            below = a[i]
-            for j in range(i, n):
-                below[j] -= weight * row[j]
+        for j in range(k + one, stop):
+            a[k, j] *= scale
+        for i in range(k + one, stop):
+            weight = a[k, i]
+            for j in range(i, stop):
+                a[i, j] -= weight * a[k, j]
     return True
 
 
 @jit()
 def invert_triangle(factor: FloatArray, n: int, whitened: FloatArray) -> None:
     """Set the lower triangle of `whitened` to ``U^-T``."""
-    for i in range(n):
-        row = whitened[i]
-        for j in range(i + 1):
-            row[j] = 0.0
+    one = np.uintp(1)
+    for i in range(np.uintp(n)):
+        for j in range(i + one):
+            whitened[i, j] = 0.0
         for k in range(i):
             weight = factor[k, i]
-            above = whitened[k]
-            for j in range(k + 1):
-                row[j] -= weight * above[j]
+            for j in range(k + one):
+                whitened[i, j] -= weight * whitened[k, j]
         scale = 1.0 / factor[i, i]
         for j in range(i):
-            row[j] *= scale
-        row[i] = scale
+            whitened[i, j] *= scale
+        whitened[i, i] = scale
 
 
 @jit()
@@ -139,17 +136,16 @@ def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray
 
     `whitened` is working space; its lower triangle becomes ``U^-T``.
     """
+    stop, one = np.uintp(n), np.uintp(1)
     invert_triangle(factor, n, whitened)
-    for i in range(n):
-        for j in range(i + 1):
+    for i in range(stop):
+        for j in range(i + one):
             inverse[i, j] = 0.0
-    for k in range(n):
-        row = whitened[k]
-        for i in range(k + 1):
-            weight = row[i]
-            target = inverse[i]
-            for j in range(i + 1):
-                target[j] += weight * row[j]
-    for i in range(n):
+    for k in range(stop):
+        for i in range(k + one):
+            weight = whitened[k, i]
+            for j in range(i + one):
+                inverse[i, j] += weight * whitened[k, j]
+    for i in range(stop):
         for j in range(i):
             inverse[j, i] = inverse[i, j]

@@ -24,7 +24,7 @@ from gp_ground_seg.core.pipeline.polar_grid import (
     vertical_density,
 )
 
-BLOCK = 512
+BLOCK = 2048
 """Points sorted at a time, so that their intermediate values stay in the nearest cache."""
 
 

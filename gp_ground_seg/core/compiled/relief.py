@@ -100,11 +100,12 @@ def _set_pieces(
         land[k] = faded(land[k])
     for i in range(N_SIDES - 1):
         for j in range(N_SIDES - 1):
-            k, piece = _place(i, j), pieces[i, j]
+            k = _place(i, j)
             if chosen[k]:
                 corners = land[k], land[k + _WIDTH], land[k + 1], land[k + 1 + _WIDTH]
                 level, along_u, along_v, twist = piece_of(*corners, i, j)
-                piece[0], piece[1], piece[2], piece[3] = level, along_u, along_v, twist
+                pieces[i, j, 0], pieces[i, j, 1] = level, along_u
+                pieces[i, j, 2], pieces[i, j, 3] = along_v, twist
 
 
 @jit()

@@ -41,10 +41,12 @@ def find_faces(
     sums = _sum_returns(columns, tiles, tall, config.cell_size, label, tile_to_row)
     for k in range(len(tall)):
         low, high = sums[2 * k], sums[2 * k + 1]
-        top = max(low[_TOP], high[_TOP])
-        if top > face_height(label) and is_vertical(low, high, config):
-            faces.is_face[tall[k]] = True
-            faces.has_occluded_base[tall[k]] = is_base_occluded(low, high, config)
+        # No branch: between branches, references to the rows would be counted.
+        is_face = is_vertical(low, high, config)
+        is_face &= max(low[_TOP], high[_TOP]) > face_height(label)
+        faces.is_face[np.uintp(tall[k])] = is_face
+        is_occluded = is_face & is_base_occluded(low, high, config)
+        faces.has_occluded_base[np.uintp(tall[k])] = is_occluded
 
 
 @jit()
