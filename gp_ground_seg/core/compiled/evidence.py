@@ -92,16 +92,16 @@ def _find_seeds(
         for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
             if seed[i]:
                 table[m, candidates.bin[i]] = candidates.z[i] - frame.prior_mean
-    rise_along(table, n_bins, max_slope, knots)
+    _rise_along(table, n_bins, max_slope, knots)
     rise = np.empty(n_bins)
     for j in range(n_bins):
         rise[j] = max_slope * 2.0 * math.pi / n_segments * knots[j]
     # Twice around, as the segments form a ring.
     for m in range(1, 2 * n_segments):
-        rise_from(table[m % n_segments], table[(m - 1) % n_segments], rise)
+        _rise_from(table, m % n_segments, (m - 1) % n_segments, rise)
     for m in range(2 * n_segments - 2, -1, -1):
-        rise_from(table[m % n_segments], table[(m + 1) % n_segments], rise)
-    rise_along(table, n_bins, max_slope, knots)
+        _rise_from(table, m % n_segments, (m + 1) % n_segments, rise)
+    _rise_along(table, n_bins, max_slope, knots)
     n_standing = n_near = 0
     sigma_n = math.exp(theta[1])
     for m in range(n_segments):
@@ -117,23 +117,27 @@ def _find_seeds(
 
 
 @jit()
-def rise_from(row: FloatArray, other: FloatArray, rise: FloatArray) -> None:
+def _rise_from(table: FloatArray, m: int, other: int, rise: FloatArray) -> None:
     """Let the ground rise from one segment to the next."""
     # Unsigned, as a signed index could count from the end.
+    to, by = np.uintp(m), np.uintp(other)
     for j in range(np.uintp(0), np.uintp(len(rise))):
-        highest = other[j] + rise[j]
-        row[j] = highest if highest < row[j] else row[j]
+        highest = table[by, j] + rise[j]
+        table[to, j] = highest if highest < table[to, j] else table[to, j]
 
 
 @jit()
-def rise_along(table: FloatArray, n_bins: int, max_slope: float, knots: FloatArray) -> None:
+def _rise_along(table: FloatArray, n_bins: int, max_slope: float, knots: FloatArray) -> None:
     """Let the ground rise outwards, then inwards."""
-    for m in range(len(table)):
-        row = table[m]
-        for j in range(1, n_bins):
-            row[j] = min(row[j], row[j - 1] + max_slope * (knots[j] - knots[j - 1]))
-        for j in range(n_bins - 2, -1, -1):
-            row[j] = min(row[j], row[j + 1] + max_slope * (knots[j + 1] - knots[j]))
+    # Bin by bin: along one segment each minimum would wait for the one before.
+    for j in range(1, n_bins):
+        rise = max_slope * (knots[j] - knots[j - 1])
+        for m in range(len(table)):
+            table[m, j] = min(table[m, j], table[m, j - 1] + rise)
+    for j in range(n_bins - 2, -1, -1):
+        rise = max_slope * (knots[j + 1] - knots[j])
+        for m in range(len(table)):
+            table[m, j] = min(table[m, j], table[m, j + 1] + rise)
 
 
 @jit()
