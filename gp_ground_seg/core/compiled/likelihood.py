@@ -100,27 +100,29 @@ def _predict_log_length_scales(
     theta: FloatArray, l_bar: FloatArray, r: FloatArray, latent: _Latent, u: FloatArray
 ) -> bool:
     """Set the arrays of `latent`, and `u`; False if B is not positive definite."""
-    r_bar, n, p = latent.r_bar, len(r), len(latent.r_bar)
+    r_bar, n, p = latent.r_bar, np.uintp(len(r)), np.uintp(len(latent.r_bar))
+    k_bar, factor, k_star = latent.k_bar, latent.factor, latent.k_star
     variance, noise = math.exp(theta[2]) ** 2, math.exp(theta[4]) ** 2
     sharpness = 0.5 / math.exp(theta[3]) ** 2
     mean = 0.0
     for i in range(p):
         mean += l_bar[i] / p
-        centre, row, factor_row = r_bar[i], latent.k_bar[i], latent.factor[i]
+        centre = r_bar[i]
         for j in range(p):
-            row[j] = factor_row[j] = squared_exponential(centre, r_bar[j], variance, sharpness)
-        factor_row[i] += noise
-    if not factorise(latent.factor, p):
+            value = squared_exponential(centre, r_bar[j], variance, sharpness)
+            k_bar[i, j] = factor[i, j] = value
+        factor[i, i] += noise
+    if not factorise(factor, len(r_bar)):
         return False
-    invert(latent.factor, p, np.empty((p, p)), latent.inverse)
+    invert(factor, len(r_bar), np.empty(factor.shape), latent.inverse)
     for i in range(p):
         for j in range(p):
             latent.beta[i] += latent.inverse[i, j] * (l_bar[j] - mean)
     for i in range(n):
-        value, centre, row = mean, r[i], latent.k_star[i]
+        value, centre = mean, r[i]
         for j in range(p):
-            row[j] = squared_exponential(centre, r_bar[j], variance, sharpness)
-            value += row[j] * latent.beta[j]
+            k_star[i, j] = squared_exponential(centre, r_bar[j], variance, sharpness)
+            value += k_star[i, j] * latent.beta[j]
         u[i] = min(max(value, -MAX_ABS_LOG_LENGTH_SCALE), MAX_ABS_LOG_LENGTH_SCALE)
     return True
 
@@ -135,19 +137,18 @@ def _factorise_covariance(
     factor: FloatArray,
 ) -> bool:
     """Set the upper triangles of K, and of the factor of A; False if that is not possible."""
-    n, variance, noise = len(r), math.exp(theta[0]) ** 2, math.exp(theta[1]) ** 2
-    length_scale = np.empty(n)
+    n, variance, noise = np.uintp(len(r)), math.exp(theta[0]) ** 2, math.exp(theta[1]) ** 2
+    length_scale = np.empty(len(r))
     for i in range(n):
         length_scale[i] = math.exp(u[i])
     for i in range(n):
         r_i, l_i, tilt = r[i], length_scale[i], slope_std**2 * r[i]
-        row, factor_row = k[i], factor[i]
         for j in range(i, n):
             value = paciorek(r_i, l_i, r[j], length_scale[j], variance)
-            row[j] = value
-            factor_row[j] = value + tilt * r[j]
-        factor_row[i] += noise
-    return factorise(factor, n)
+            k[i, j] = value
+            factor[i, j] = value + tilt * r[j]
+        factor[i, i] += noise
+    return factorise(factor, len(r))
 
 
 @jit(part=True)
@@ -202,13 +203,12 @@ def _of_observations(
     g_u: FloatArray,
 ) -> float:
     """Return the value of the observations; set their gradient, and that in `u`."""
-    n = len(r)
-    alpha, square = np.zeros(n), np.empty(n)
-    value = -0.5 * n * _LOG_2PI
+    n, one = np.uintp(len(r)), np.uintp(1)
+    alpha, square = np.zeros(len(r)), np.empty(len(r))
+    value = -0.5 * len(r) * _LOG_2PI
     for i in range(n):
-        row = inverse[i]
         for j in range(n):
-            alpha[i] += row[j] * z[j]
+            alpha[i] += inverse[i, j] * z[j]
         value -= 0.5 * z[i] * alpha[i] + math.log(factor[i, i])
         square[i] = math.exp(2.0 * u[i])
     g_sigma_f = g_trace = 0.0
@@ -216,10 +216,10 @@ def _of_observations(
         g_ii = 0.5 * (alpha[i] * alpha[i] - inverse[i, i])
         g_trace += g_ii
         g_sigma_f += 2.0 * g_ii * k[i, i]
-        alpha_i, r_i, square_i, row, inverse_row = alpha[i], r[i], square[i], k[i], inverse[i]
+        alpha_i, r_i, square_i = alpha[i], r[i], square[i]
         total = g_u_i = 0.0
-        for j in range(i + 1, n):
-            g_k = (alpha_i * alpha[j] - inverse_row[j]) * row[j]
+        for j in range(i + one, n):
+            g_k = (alpha_i * alpha[j] - inverse[i, j]) * k[i, j]
             total += g_k
             d = r_i - r[j]
             # l_i^2 / (l_i^2 + l_j^2), from which dlog k / du follows.
@@ -249,32 +249,33 @@ def _of_latent_process(
     gradient: FloatArray,
 ) -> float:
     """Propagate the gradient in u to theta; return the latent terms of the value."""
-    r_bar, beta, n, p = latent.r_bar, latent.beta, len(r), len(latent.r_bar)
-    weight, raised = np.zeros(p), np.zeros(p)
+    r_bar, beta, n, p = latent.r_bar, latent.beta, np.uintp(len(r)), np.uintp(len(latent.r_bar))
+    k_bar, inverse, k_star = latent.k_bar, latent.inverse, latent.k_star
+    weight, raised = np.zeros(len(r_bar)), np.zeros(len(r_bar))
     value = g_sigma_f_bar = g_sigma_l_bar = g_noise_bar = rest = 0.0
     for i in range(n):
         rest += g_u[i] / p
-        g_i, r_i, row = g_u[i], r[i], latent.k_star[i]
+        g_i, r_i = g_u[i], r[i]
         for j in range(p):
-            raised[j] += row[j] * g_i
+            raised[j] += k_star[i, j] * g_i
             d = r_i - r_bar[j]
-            term = g_i * row[j] * beta[j]
+            term = g_i * k_star[i, j] * beta[j]
             g_sigma_f_bar += term
             g_sigma_l_bar += term * d * d
     share = 0.5 if latent_terms else 0.0
     for i in range(p):
-        r_i, row, inverse_row = r_bar[i], latent.k_bar[i], latent.inverse[i]
+        r_i = r_bar[i]
         for j in range(p):
-            weight[i] += inverse_row[j] * raised[j]
+            weight[i] += inverse[i, j] * raised[j]
         if latent_terms:
             value -= math.log(latent.factor[i, i]) + 0.5 * _LOG_2PI
         for j in range(p):
             d = r_i - r_bar[j]
             # Adjoint of B: every derivative of B is contracted with it.
-            adjoint = -weight[i] * beta[j] - share * inverse_row[j]
-            g_sigma_f_bar += adjoint * row[j]
-            g_sigma_l_bar += adjoint * row[j] * d * d
-        g_noise_bar -= weight[i] * beta[i] + share * inverse_row[i]
+            adjoint = -weight[i] * beta[j] - share * inverse[i, j]
+            g_sigma_f_bar += adjoint * k_bar[i, j]
+            g_sigma_l_bar += adjoint * k_bar[i, j] * d * d
+        g_noise_bar -= weight[i] * beta[i] + share * inverse[i, i]
         gradient[5 + kind[i]] += weight[i]
         rest -= weight[i] / p
     # u is the mean of L-bar and what the process makes of the differences from it.
