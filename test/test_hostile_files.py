@@ -81,7 +81,8 @@ def test_loops_of_links_and_names_too_long_are_one_line(tmp_path, monkeypatch, c
 
 def in_shell(words, cwd):
     """Exit code, stdout and stderr of a command with the redirections of a shell."""
-    line = f'{sys.executable} -m gp_ground_seg {words}'
+    # With it Python forgets what a full stream has refused; users mostly go without.
+    line = f'env -u PYTHONUNBUFFERED {sys.executable} -m gp_ground_seg {words}'
     done = subprocess.run(line, shell=True, cwd=cwd, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout, done.stderr
 

@@ -15,7 +15,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 from gp_ground_seg import __version__
 from gp_ground_seg.core.errors import GroundSegError, in_one_line, reason_of, shown
@@ -231,10 +231,10 @@ def _prepare_streams() -> None:
         sys.stdout.reconfigure(errors='backslashreplace')
 
 
-def _abandon_output() -> None:
-    """Send the rest of standard output nowhere, so that Python does not fail on it at its end."""
+def _abandon(stream: TextIO) -> None:
+    """Send the rest of a standard stream nowhere, so that Python does not fail on it at exit."""
     with suppress(OSError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _run(words: list[str]) -> int:
@@ -258,17 +258,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     _prepare_streams()
+    try:
+        return _code_of(words)
+    finally:
+        try:
+            sys.stderr.flush()
+        except OSError:  # it is full: what it still holds would make the exit code 120
+            _abandon(sys.stderr)
+
+
+def _code_of(words: list[str]) -> int:
+    """Run the command, say in one line what is wrong, and return the exit code."""
     code = 2
     try:
         return _run(words)
     except BrokenPipeError:
         # The reader of our output went away (as in `| head`); nothing is wrong here.
-        _abandon_output()
+        _abandon(sys.stdout)
         return 0
     except GroundSegError as error:
         line = f'error: {error}'
     except OSError as error:
-        _abandon_output()
+        _abandon(sys.stdout)
         line = f'error: {error.filename or "input or output"}: {reason_of(error)}'
     except UnicodeError as error:
         line = f'error: {in_one_line(error)}: a name or text is not UTF-8'

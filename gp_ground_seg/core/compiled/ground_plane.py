@@ -131,10 +131,11 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
 @jit()
 def _sort(r: FloatArray, z: FloatArray, home: IntArray, first: int, end: int) -> None:
     """Sort the candidates from `first` to `end` by height, then by range, in place: few."""
-    for k in range(first + 1, end):
-        r_k, z_k, home_k, place = r[k], z[k], home[k], np.uintp(k)
-        while place > first:
-            before = place - np.uintp(1)
+    start, one = np.uintp(first), np.uintp(1)
+    for k in range(start + one, np.uintp(end)):
+        r_k, z_k, home_k, place = r[k], z[k], home[k], k
+        while place > start:
+            before = place - one
             if z[before] < z_k or (z[before] == z_k and r[before] <= r_k):
                 break
             r[place], z[place], home[place] = r[before], z[before], home[before]

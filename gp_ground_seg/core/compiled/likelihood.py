@@ -1,4 +1,4 @@
-"""Compiled twin of `gp_ground_seg.core.gp.likelihood`."""
+"""Compiled twin of `gp_ground_seg.core.gp.likelihood`; for its indices see `numerics`."""
 
 from __future__ import annotations
 

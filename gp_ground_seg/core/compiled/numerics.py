@@ -1,6 +1,8 @@
 """Arithmetic of compiled code: a fast exponential, and small dense systems.
 
-Every inner loop runs along a row, so that the compiler can use vector instructions.
+Every inner loop runs along a row, so that the compiler can use vector instructions. Elements are
+taken by two unsigned indices: the references to a view of a row are counted, which takes longer
+than a short row, and a signed index could count from the end.
 """
 
 from __future__ import annotations
@@ -64,8 +66,6 @@ exp_neg_single = _make_exp_neg(np.float32, 4, NEGLIGIBLE_SINGLE)
 compiled_form(kernels.exp_neg, single=exp_neg_single)(exp_neg)
 
 
-# Below, elements are taken by two unsigned indices: of a view of a row, references are counted,
-# which takes longer than a short row; a signed index could count from the end.
 @jit()
 def solve_in_place(matrix: FloatArray, n: int, vector: FloatArray) -> bool:
     """Replace `vector` by the solution of ``A x = vector``; False if not positive definite.

@@ -25,7 +25,7 @@ from gp_ground_seg.core.pipeline.polar_grid import (
 )
 
 BLOCK = 2048
-"""Points sorted at a time, so that their intermediate values stay in the nearest cache."""
+"""Points sorted at a time, so that their intermediate values stay in the nearest caches."""
 
 
 @jit(entry=True)

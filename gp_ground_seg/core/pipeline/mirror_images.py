@@ -99,7 +99,7 @@ def is_wet(candidates: Candidates, plane_z: float, sensor_z: float) -> bool:
     r, z = candidates.r[near], candidates.z[near]
     is_ground = is_on_plane(r, z, plane_z)
     most_if_dry = WET_SHARE * np.count_nonzero(is_ground)
-    # Most scans end here: even if all that is deep were an image, the road would be dry.
+    # Even if all that is deep were an image, the road would be dry.
     if np.count_nonzero(z < plane_z - DEEP) <= most_if_dry:
         return False
     slope = slope_of_sight(r, z, sensor_z)
