@@ -26,8 +26,6 @@ from gp_ground_seg.core.pipeline.roughness import (
 
 WordArray = npt.NDArray[np.uint64]
 N_WORDS = N_LEVELS // 8
-# One more, so that no loop over them has a remainder.
-_EDGES = np.append(SQUARE_EDGES, np.inf)
 _ONES, _LOWEST_BYTE = np.uint64(0x0101010101010101), np.uint64(255)
 
 
@@ -74,8 +72,8 @@ def _known_levels(sums: IntArray, units: float) -> tuple[CellArray, CellArray, i
         if number > 0:
             square = np.float64(sums[t, 1]) / (units * np.float64(number))
             found = 0
-            for k in range(len(_EDGES)):
-                found += np.int64(square >= _EDGES[k])
+            for k in range(len(SQUARE_EDGES)):
+                found += np.int64(square >= SQUARE_EDGES[k])
             known[n_known], level[n_known] = t, found
             counts[found] += 1
             n_known += 1
