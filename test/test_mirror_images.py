@@ -10,7 +10,14 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.frame import Candidates, Label
-from gp_ground_seg.core.pipeline.mirror_images import DEEP, find_mirror_images, is_wet
+from gp_ground_seg.core.pipeline.ground_plane import fit_plane
+from gp_ground_seg.core.pipeline.mirror_images import (
+    DEEP,
+    find_mirror_images,
+    in_sight,
+    is_mirror,
+    is_wet,
+)
 from gp_ground_seg.lab.simulation import SENSORS
 
 WET = [('hdl-64e', 0), ('vlp-16', 1), ('os1-128', 2)]
@@ -98,3 +105,63 @@ def test_backends_agree_on_which_road_is_wet():
         found.append(NumpyBackend().is_wet(candidates, -1.7, 0.1))
         assert NumbaBackend().is_wet(candidates, -1.7, 0.1) == found[-1]
     assert 30 < sum(found) < 270
+
+
+def hall(height, steepest, seed, *, is_polished=False, has_tables=False):
+    """Scan by 64 beams in a hall of 16 by 12 m, and which of its returns are of the floor.
+
+    A polished floor mirrors a third of the rays. Tables stand in rows, 0.72 m high, with 0.6 and
+    0.7 m between them.
+    """
+    rng = np.random.default_rng(seed)
+    elevation, azimuth = np.meshgrid(
+        np.linspace(-steepest, steepest, 64), np.linspace(-np.pi, np.pi, 1024, endpoint=False)
+    )
+    rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)])
+    rays = np.concatenate([rays, np.sin(elevation)[None]]).reshape(3, -1)
+    sides = np.abs(rays / np.array([[8.0], [6.0], [1.0]]))
+    down, down_to_table = rays[2] < 0.0, np.where(rays[2] < 0.0, (0.72 - height) / rays[2], 99.0)
+    to_wall = 1.0 / np.maximum(sides[0], sides[1])
+    to_floor = np.where(down, -height / rays[2], np.inf)
+    to_ceiling = np.where(down, np.inf, (3.0 - height) / rays[2])
+    t = np.minimum(np.minimum(to_wall, to_floor), to_ceiling)
+    is_floor = t == to_floor
+    if is_polished:
+        mirrored = is_floor & (rng.random(len(t)) < 0.35)
+        # Below the floor the hall stands upside down.
+        t[mirrored] = np.minimum(to_wall, (3.0 + height) / np.abs(rays[2]))[mirrored]
+        is_floor &= ~mirrored
+    if has_tables:
+        x, y = rays[:2] * down_to_table
+        hits = (down_to_table < t) & (x % 2.2 < 1.6) & (y % 1.5 < 0.8)
+        t[hits], is_floor[hits] = down_to_table[hits], False
+    points = rays * (t + rng.normal(0.0, 0.01, len(t)))
+    return points.T.astype(np.float32), is_floor
+
+
+@pytest.mark.parametrize(('height', 'steepest'), [(0.45, 0.78), (0.8, 0.6)])
+def test_the_floor_of_a_polished_hall_is_the_ground(backend, height, steepest):
+    points, is_floor = hall(height, steepest, 0, is_polished=True)
+    points[::100] = np.tile([[np.nan, np.inf, -np.inf, 1e38]], (3, 1)).T[np.arange(656) % 4]
+    is_floor[::100] = False
+    result = GroundSegmenter(backend=backend).segment(points)
+    assert result.pose.height == pytest.approx(height, abs=0.03)
+    assert (result.is_ground & is_floor).sum() / (result.is_ground | is_floor).sum() > 0.9
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_polished_floor_is_a_mirror_and_tables_are_not(seed):
+    origin = (0.0, 0.0, 0.0)
+    for height, steepest, plane_z, kind in (
+        (0.45, 0.78, -0.45, {'is_polished': True}),
+        (0.45, 0.78, -0.45, {}),
+        (1.2, 0.3, -0.48, {'has_tables': True}),
+    ):
+        scan = NumpyBackend().build_grid(hall(height, steepest, seed, **kind)[0], Config())
+        plane = fit_plane(in_sight(scan.candidates, 0.0), 1.0, origin)
+        assert -plane.height == pytest.approx(plane_z, abs=0.03)
+        assert is_mirror(plane, scan, origin) == ('is_polished' in kind)
+        # Much of the floor lies below the line of sight to tables that are nearer.
+        assert is_wet(scan.candidates, plane_z, 0.0) == bool(kind)
+        # Where rays start must be known.
+        assert not is_mirror(plane, scan, (0.5, 0.0, 0.0))

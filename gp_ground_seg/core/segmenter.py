@@ -27,7 +27,12 @@ from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.parameters.schema import NO_BOX
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
-from gp_ground_seg.core.pipeline.mirror_images import MirrorImages, find_mirror_images
+from gp_ground_seg.core.pipeline.mirror_images import (
+    MirrorImages,
+    find_mirror_images,
+    in_sight,
+    is_mirror,
+)
 from gp_ground_seg.core.pipeline.points import (
     ENOUGH_POINTS,
     Direction,
@@ -50,6 +55,7 @@ from gp_ground_seg.core.pipeline.up_axis import (
     View,
     clearest,
     is_doubtful,
+    may_be_image,
     view_of,
 )
 from gp_ground_seg.core.result import Segmentation
@@ -271,13 +277,16 @@ class GroundSegmenter:
         scan = backend.build_grid(level, config)
         timer.mark('grid')
         origin, elsewhere = origin_of(sensor), None
-        below = view = self._look(scan, UPRIGHT, origin)
-        if is_doubtful(below):
+        seen, below = scan, self._look(scan, UPRIGHT, origin)
+        if may_be_image(below):
+            seen, below = self._past_images(scan, below, origin)
+        view = below
+        if seen is scan and is_doubtful(below):
             view = self._find_ground(level, below, origin)
         if view is not None and not view.can_level:
             # The scan will not be levelled: the ground that matters is about level.
             elsewhere = view if view.tells_tilt else None
-            view = self._look(scan, UPRIGHT, origin, CLEAR_TILT) or below
+            view = self._look(seen, UPRIGHT, origin, CLEAR_TILT) or below
         pose = estimate_pose(scan.candidates, sensor, view, elsewhere)
         if fallback is not None:
             pose = with_fallback(pose, fallback, sensor)
@@ -288,6 +297,19 @@ class GroundSegmenter:
             scan = images.left_out(backend.build_grid(images.raised(scan.xyz), config))
         timer.mark('pose')
         return scan, pose, images
+
+    def _past_images(
+        self, scan: Scan, below: View | None, origin: Direction
+    ) -> tuple[Scan, View | None]:
+        """Scan of the candidates that are no mirror images, and their plane, if it is a mirror.
+
+        Else the scan as it is, and the plane `below`.
+        """
+        left = scan._replace(candidates=in_sight(scan.candidates, origin[2]))
+        view = self._look(left, UPRIGHT, origin)
+        if view is None or not (view.tells_height and is_mirror(view.plane, scan, origin)):
+            return scan, below
+        return left, view
 
     def _look(
         self, scan: Scan, turn: FloatArray, origin: Direction, max_tilt: float = MAX_TILT

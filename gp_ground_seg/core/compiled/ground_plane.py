@@ -8,7 +8,7 @@ from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray
 from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import (
-    CLEARLY_BELOW,
+    CLEARLY_OFF,
     LEAST_REACH,
     MAX_Z,
     N_RINGS,
@@ -186,7 +186,7 @@ def refutation_of(plane: Plane, cells: LowestPoints, n: int, origin: Direction) 
             sector = cells.cell[c] // N_RINGS
             is_seen[cells.cell[c]], reach[sector] = True, max(reach[sector], cells.r[c])
     for c in range(n):
-        if heights[c] * cells.inverse[c] < -CLEARLY_BELOW:
+        if heights[c] * cells.inverse[c] < -CLEARLY_OFF:
             sector = cells.cell[c] // N_RINGS
             crossing = crossed_at(cells.r[c], heights[c], clearance)
             if crossing < reach[sector]:

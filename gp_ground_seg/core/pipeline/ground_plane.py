@@ -41,8 +41,8 @@ FAR = 10.0
 MIN_HEIGHT, MAX_HEIGHT = SENSOR_HEIGHTS
 """Heights of the origin over a plane that can be the ground [m]; in the frame of a vehicle the
 ground may lie above it."""
-CLEARLY_BELOW = 2.0
-"""Distance below the plane, in tolerances, from which a point may be evidence against it."""
+CLEARLY_OFF = 2.0
+"""Distance from a plane, in tolerances, from which a point may be evidence against it."""
 MIDDLE = 4.0
 """Range of the points with the most weight [m]: nearer ones may be the robot's own body, and
 farther ones another level than the one that it stands on."""
@@ -55,8 +55,9 @@ REFUTATION = 8.0
 Plane = tuple[float, float, float]
 """Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
 NumbersOfPlane = tuple[
-    float, float, float, float, float, float, float, float, float, float, float, float, int, int
-]
+    float, float, float, float, float, float, float, float, float, float, float, float, float,
+    int, int,
+]  # fmt: skip
 """Fields of a `GroundPlane`."""
 
 N_TRIPLES = 192
@@ -176,6 +177,8 @@ class GroundPlane(NamedTuple):
     # of them left out at either end: the lowest beam alone, on walls, makes a cone that looks
     # like a plane.
     spread: float
+    # share of the sectors with any cell whose nearest, lower than the sensor, is clearly over it
+    overhang: float
     residual: float  # root mean square of the distances along z of these cells to it [m]
     n_cells: int  # how many cells there were
     n_support: int  # how many of them lie on it
@@ -221,7 +224,7 @@ def fit_cells(cells: LowestPoints, n: int, max_slope: float, origin: Direction) 
     if n >= MIN_CELLS:
         is_found, best = best_hypothesis(cells, n, max_slope, origin)
     if not is_found:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
     plane = refined(cells, best)
     if not is_possible(plane, LOOSER * max_slope):
         # The refinement has drifted off to a plane that cannot be the ground.
@@ -358,7 +361,7 @@ def refutation_of(plane: Plane, cells: LowestPoints, n: int, origin: Direction) 
     """
     height = distance(cells.x, cells.y, cells.z, plane)
     d, sector = height * cells.inverse, cells.cell // N_RINGS
-    is_on, is_below = np.abs(d) < 1.0, d < -CLEARLY_BELOW
+    is_on, is_below = np.abs(d) < 1.0, d < -CLEARLY_OFF
     is_seen, reach = np.zeros(N_SECTORS * N_RINGS, dtype=bool), np.full(N_SECTORS, LEAST_REACH)
     is_seen[cells.cell[is_on]] = True
     np.maximum.at(reach, sector[is_on], cells.r[is_on])
@@ -440,16 +443,17 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> N
     height, slope_x, slope_y = plane
     ranges, drops, near, angles = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     n_on_it, n_near, squares, weight, whole = 0, 0, 0.0, 0.0, 0.0
-    n_seen = n_covered = n_far = 0
+    n_seen = n_covered = n_far = n_over = 0
     last_seen = last_covered = last_far = -1
     for c in range(n):
         sector, r = cells.cell[c] // N_RINGS, cells.r[c]
         whole += cells.weight[c]
-        # Cells come sector by sector: one that differs from the last is new.
-        if sector != last_seen:
-            n_seen, last_seen = n_seen + 1, sector
         z = cells.z[c]
         d = distance(cells.x[c], cells.y[c], z, plane)
+        # Cells come sector by sector, from near to far: one that differs from the last is new.
+        if sector != last_seen:
+            n_seen, last_seen = n_seen + 1, sector
+            n_over += d > CLEARLY_OFF * cells.tolerance[c] and z < origin[2]
         if not abs(d) <= cells.tolerance[c]:
             z = cells.lowest_z[c]
             d = distance(cells.x[c], cells.y[c], z, plane)
@@ -468,14 +472,15 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> N
         if r >= FAR and sector != last_far:
             n_far, last_far = n_far + 1, sector
     if n_on_it == 0:
-        return height, slope_x, slope_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
+        return height, slope_x, slope_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
     few, most = n_on_it // 10, (9 * n_on_it) // 10
     lift = ranked(near[:n_near], n_near // 2) if n_near >= ENOUGH_NEAR else 0.0
-    spread = ranked(drops[:n_on_it], most) - ranked(drops[:n_on_it], few)
     return (
         height, slope_x, slope_y, height - lift, n_on_it / n, weight / whole,
         n_covered / N_SECTORS, n_far / n_seen, ranked(ranges[:n_on_it], most),
-        ranked(angles[:n_on_it], most), spread, math.sqrt(squares / n_on_it), n, n_on_it,
+        ranked(angles[:n_on_it], most),
+        ranked(drops[:n_on_it], most) - ranked(drops[:n_on_it], few),
+        n_over / n_seen, math.sqrt(squares / n_on_it), n, n_on_it,
     )  # fmt: skip
 
 

@@ -1,15 +1,18 @@
-"""Stage 2: mirror images of things on a wet road.
+"""Stage 2: mirror images of things on a wet road, or in a polished floor.
 
 A ray that the road reflects is taken to have gone straight on: its return lies as far below the
 road as what it met stands above, at the same place in plan. Such a ray seems to pass below ground
 that is seen nearer, which no ray can, while over the edge of a ditch, a dock or stairs rays pass
 above it. Images that are raised again to what they are images of are no ground.
+
+Where images are the lowest returns of most cells, the plane of the ground is looked for past them.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,8 +27,9 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import SensorConfig
-from gp_ground_seg.core.pipeline.ground_plane import tolerance_at
-from gp_ground_seg.core.pipeline.low_sensor import is_seen_from_sensor
+from gp_ground_seg.core.pipeline.ground_plane import GroundPlane, crossed_at, tolerance_at
+from gp_ground_seg.core.pipeline.low_sensor import MIN_DEPRESSION
+from gp_ground_seg.core.pipeline.points import Direction
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
 DEEP = 0.15
@@ -44,6 +48,13 @@ N_ASIDE = 4
 WET_SHARE, WET_REACH = 0.1, 20.0
 """Images among the candidates for each on the plane, both up to this range [m], from which a road
 is wet: of dry scans the most was 0.07, of wet ones the least 0.14."""
+MIRRORED = 0.7
+"""Share of what is deep below a mirror that is seen through returns on it: of dry scans the most
+was 0.57, of wet ones, but for those of rough ground, the least 0.81."""
+RING, LEAST_RANGE = 0.03, 0.1
+"""Width of the rings in which these returns are looked for, in parts of the range, and least range
+that is told [m]: in that where a ray to an image crosses the mirror or the next on either side,
+and in one of the next seven behind these."""
 IsWet = Callable[[Candidates, float, float], bool]
 
 
@@ -79,7 +90,7 @@ def find_mirror_images(
     """
     none = MirrorImages(np.zeros(0, dtype=np.int64), np.zeros(0))
     x, y, up = (pose.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)).tolist()
-    if not is_seen_from_sensor(pose) or (x, y) != (0.0, 0.0):
+    if pose.measured is None or not can_mirror(pose.measured.plane, (x, y, up)):
         return none
     grid, plane_z = scan.grid, -pose.height
     if not (up > plane_z and is_wet(scan.candidates, plane_z, up)):
@@ -88,7 +99,8 @@ def find_mirror_images(
     r, z = grid.r[inside].astype(np.float64), scan.xyz[inside, 2].astype(np.float64)
     slope, cell = slope_of_sight(r, z, up), grid.cell[inside].astype(np.int64)
     is_ground = (r < GROUND_REACH) & is_on_plane(r, z, plane_z)
-    nearer = _nearer_about(slope[is_ground], cell[is_ground], (grid.n_segments, grid.n_bins))[cell]
+    shape = grid.n_segments, grid.n_bins
+    nearer = _nearer_about(slope[is_ground], cell[is_ground], shape, N_ASIDE)[cell]
     found = is_image(r, z, slope, nearer, plane_z, up, -OVER_SIGHT)
     return MirrorImages(inside[found], -2.0 * (z[found] + pose.height))
 
@@ -106,6 +118,63 @@ def is_wet(candidates: Candidates, plane_z: float, sensor_z: float) -> bool:
     nearer = _nearer_in_segment(slope, is_ground, candidates.segment[near])
     found = is_image(r, z, slope, nearer, plane_z, sensor_z, BELOW_SIGHT)
     return bool(np.count_nonzero(found) > most_if_dry)
+
+
+def in_sight(candidates: Candidates, sensor_z: float) -> Candidates:
+    """Candidates below the sensor to which no ray passes below a nearer one beside it.
+
+    Mirror images may be the lowest returns of most cells: a plane through these is that of a
+    ceiling, or of nothing.
+    """
+    slope = slope_of_sight(candidates.r, candidates.z, sensor_z)
+    shape = candidates.n_segments, int(candidates.bin.max(initial=0)) + 1
+    cell = candidates.segment * shape[1] + candidates.bin
+    tells = np.flatnonzero((candidates.r >= NEAREST) & (slope < 0.0))
+    nearer = _nearer_about(slope[tells], cell[tells], shape, 1)[cell]
+    return candidates.where((slope < 0.0) & (slope >= nearer))
+
+
+@np.errstate(invalid='ignore', over='ignore')
+def is_mirror(plane: GroundPlane, scan: Scan, origin: Direction) -> bool:
+    """Whether much is deep below a plane, and most of it is seen through returns on the plane.
+
+    Of rays that meet a wet floor side by side some come back from it, others from what they are
+    mirrored to, and it goes on behind. Rays below a table cross its plane where there is none; the
+    land ends where rays pass over an edge. `origin` is where rays start [m].
+    """
+    if not can_mirror(plane, origin):
+        return False
+    grid, candidates = scan.grid, scan.candidates
+    near = np.flatnonzero((candidates.r >= NEAREST) & (candidates.r < WET_REACH))
+    r, over = candidates.r[near], plane.below(candidates.x, candidates.y, candidates.z)[near]
+    deep, n_ground = over < -DEEP, np.count_nonzero(np.abs(over) <= tolerance_at(r))
+    if np.count_nonzero(deep) <= WET_SHARE * n_ground:
+        return False
+    crossing = crossed_at(r[deep], over[deep], plane.below(*origin))
+    # Points in no cell have no place on the plane: NaN, or a range beyond the last edge.
+    farthest = min(math.exp(9.0 * RING) * float(crossing.max()), float(grid.edges[-1]))
+    is_on_it = np.abs(plane.below(*scan.xyz.T)) <= tolerance_at(grid.r)
+    on_it = np.flatnonzero(is_on_it & (grid.r < farthest))
+    # Empty behind the last ring, and so before the first.
+    has_return = np.zeros((grid.n_segments, _ring_at(grid.edges[-1]) + 10), dtype=np.bool_)
+    has_return[grid.cell[on_it] // grid.n_bins, _ring_at(grid.r[on_it])] = True
+    segment, ring = candidates.segment[near[deep]], _ring_at(crossing)
+    beside, behind = (
+        np.any([has_return[segment, ring + step] for step in steps], axis=0)
+        for steps in (range(-1, 2), range(2, 9))
+    )
+    n_images = np.count_nonzero(beside & behind)
+    return bool(n_images > max(WET_SHARE * n_ground, MIRRORED * len(crossing)))
+
+
+def _ring_at(r: Values) -> Any:
+    """Return the number of the ring at a range [m]; each is wider by `RING` than the last."""
+    return (np.log(np.maximum(r, LEAST_RANGE) / LEAST_RANGE) / RING).astype(np.int64)
+
+
+def can_mirror(plane: GroundPlane, origin: Direction) -> bool:
+    """Whether rays start over the origin of the cloud, and meet the plane steeply enough."""
+    return origin[:2] == (0.0, 0.0) and plane.depression >= MIN_DEPRESSION
 
 
 @shared
@@ -154,8 +223,10 @@ def _nearer_in_segment(slope: FloatArray, is_ground: BoolArray, segment: IntArra
     return result
 
 
-def _nearer_about(slope: FloatArray, cell: IntArray, shape: tuple[int, int]) -> FloatArray:
-    """Highest slope to ground in a nearer bin, there or in `N_ASIDE` segments on either side.
+def _nearer_about(
+    slope: FloatArray, cell: IntArray, shape: tuple[int, int], n_aside: int
+) -> FloatArray:
+    """Highest slope to ground in a nearer bin, there or in `n_aside` segments on either side.
 
     `slope` and `cell`, (G,), are those of the ground, `shape` the numbers of segments and bins.
     Returns that of each cell; -inf where there is no such ground.
@@ -163,7 +234,7 @@ def _nearer_about(slope: FloatArray, cell: IntArray, shape: tuple[int, int]) -> 
     own: FloatArray = np.full(shape, -np.inf)
     np.maximum.at(own.reshape(-1), cell, slope)
     highest = own
-    for aside in range(1, N_ASIDE + 1):
+    for aside in range(1, n_aside + 1):
         both = np.maximum(np.roll(own, aside, axis=0), np.roll(own, -aside, axis=0))
         highest = np.maximum(highest, both)
     before: FloatArray = np.full(shape, -np.inf)
