@@ -161,6 +161,9 @@ def test_a_polished_floor_is_a_mirror_and_tables_are_not(seed):
         plane = fit_plane(in_sight(scan.candidates, 0.0), 1.0, origin)
         assert -plane.height == pytest.approx(plane_z, abs=0.03)
         assert is_mirror(plane, scan, origin) == ('is_polished' in kind)
+        # The best plane is that of the ceiling's image, or of the floor below the tables.
+        seen_through = fit_plane(scan.candidates, 1.0, origin).seen_through
+        assert (seen_through > 0.9) == bool(kind)
         # Much of the floor lies below the line of sight to tables that are nearer.
         assert is_wet(scan.candidates, plane_z, 0.0) == bool(kind)
         # Where rays start must be known.

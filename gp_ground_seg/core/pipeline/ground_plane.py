@@ -177,8 +177,8 @@ class GroundPlane(NamedTuple):
     # of them left out at either end: the lowest beam alone, on walls, makes a cone that looks
     # like a plane.
     spread: float
-    # share of the sectors with any cell whose nearest, lower than the sensor, is clearly over it
-    overhang: float
+    # share of the sectors with any cell where rays to it cross a nearer level that goes on behind
+    seen_through: float
     residual: float  # root mean square of the distances along z of these cells to it [m]
     n_cells: int  # how many cells there were
     n_support: int  # how many of them lie on it
@@ -443,17 +443,16 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> N
     height, slope_x, slope_y = plane
     ranges, drops, near, angles = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     n_on_it, n_near, squares, weight, whole = 0, 0, 0.0, 0.0, 0.0
-    n_seen = n_covered = n_far = n_over = 0
+    n_seen = n_covered = n_far = 0
     last_seen = last_covered = last_far = -1
     for c in range(n):
         sector, r = cells.cell[c] // N_RINGS, cells.r[c]
         whole += cells.weight[c]
-        z = cells.z[c]
-        d = distance(cells.x[c], cells.y[c], z, plane)
-        # Cells come sector by sector, from near to far: one that differs from the last is new.
+        # Cells come sector by sector: one that differs from the last is new.
         if sector != last_seen:
             n_seen, last_seen = n_seen + 1, sector
-            n_over += d > CLEARLY_OFF * cells.tolerance[c] and z < origin[2]
+        z = cells.z[c]
+        d = distance(cells.x[c], cells.y[c], z, plane)
         if not abs(d) <= cells.tolerance[c]:
             z = cells.lowest_z[c]
             d = distance(cells.x[c], cells.y[c], z, plane)
@@ -480,8 +479,32 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> N
         n_covered / N_SECTORS, n_far / n_seen, ranked(ranges[:n_on_it], most),
         ranked(angles[:n_on_it], most),
         ranked(drops[:n_on_it], most) - ranked(drops[:n_on_it], few),
-        n_over / n_seen, math.sqrt(squares / n_on_it), n, n_on_it,
+        count_seen_through(cells, n, plane, origin) / n_seen,
+        math.sqrt(squares / n_on_it), n, n_on_it,
     )  # fmt: skip
+
+
+@shared
+def count_seen_through(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> int:
+    """Count the sectors in which rays to a plane cross a level over it that goes on behind.
+
+    The level is that of the nearest cell, clearly over the plane and below the sensor, and reaches
+    as far as the farthest cell at this height. That of the own vehicle ends before.
+    """
+    n_sectors, last, last_counted, is_over, level, farthest = 0, -1, -1, False, 0.0, 0.0
+    for c in range(n):
+        sector, r, z = cells.cell[c] // N_RINGS, cells.r[c], cells.z[c]
+        over = distance(cells.x[c], cells.y[c], z, plane)
+        # Cells come sector by sector, from near to far.
+        if sector != last:
+            last, level = sector, z
+            is_over = over > CLEARLY_OFF * cells.tolerance[c] and z < origin[2]
+        crosses = r * (origin[2] - level) < farthest * (origin[2] - z)
+        if abs(z - level) <= cells.tolerance[c]:
+            farthest = r
+        elif is_over and crosses and abs(over) <= cells.tolerance[c] and sector != last_counted:
+            n_sectors, last_counted = n_sectors + 1, sector
+    return n_sectors
 
 
 def ranked(values: FloatArray, rank: int) -> float:

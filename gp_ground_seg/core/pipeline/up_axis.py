@@ -38,8 +38,8 @@ directions. A scan whose ground is farther from z than that is not levelled but 
 STEEP = math.radians(25.0)
 """Tilt from which a plane is fitted again in a frame in which it is level: lowest points of a
 tilted frame are not all ground."""
-OVERHUNG = 0.75
-"""`GroundPlane.overhang` from which a plane may lie below the ground that the sensor stands on."""
+SEEN_THROUGH = 0.75
+"""`GroundPlane.seen_through` from which a plane may lie below the ground."""
 GOOD_SUPPORT = 0.9
 """Support of a `TALL` plane below z under which other axes are tried."""
 TALL = 6.0
@@ -161,7 +161,7 @@ def is_doubtful(below: View | None) -> bool:
 
 def may_be_image(below: View | None) -> bool:
     """Whether the plane below z may be a mirror image, as of the ceiling in a polished floor."""
-    return below is None or is_doubtful(below) or below.plane.overhang >= OVERHUNG
+    return below is None or is_doubtful(below) or below.plane.seen_through >= SEEN_THROUGH
 
 
 def clearest(below: View | None, others: Iterable[View]) -> View | None:
