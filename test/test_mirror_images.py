@@ -142,7 +142,8 @@ def hall(height, steepest, seed, *, is_polished=False, has_tables=False):
 @pytest.mark.parametrize(('height', 'steepest'), [(0.45, 0.78), (0.8, 0.6)])
 def test_the_floor_of_a_polished_hall_is_the_ground(backend, height, steepest):
     points, is_floor = hall(height, steepest, 0, is_polished=True)
-    points[::100] = np.tile([[np.nan, np.inf, -np.inf, 1e38]], (3, 1)).T[np.arange(656) % 4]
+    wrong = [np.nan, np.inf, -np.inf, 1e38]
+    points[::100] = np.resize(wrong, len(points[::100]))[:, None]
     is_floor[::100] = False
     result = GroundSegmenter(backend=backend).segment(points)
     assert result.pose.height == pytest.approx(height, abs=0.03)

@@ -493,16 +493,20 @@ def count_seen_through(cells: LowestPoints, n: int, plane: Plane, origin: Direct
     """
     n_sectors, last, last_counted, is_over, level, farthest = 0, -1, -1, False, 0.0, 0.0
     for c in range(n):
-        sector, r, z = cells.cell[c] // N_RINGS, cells.r[c], cells.z[c]
-        over = distance(cells.x[c], cells.y[c], z, plane)
         # Cells come sector by sector, from near to far.
+        sector = cells.cell[c] // N_RINGS
         if sector != last:
-            last, level = sector, z
-            is_over = over > CLEARLY_OFF * cells.tolerance[c] and z < origin[2]
+            last, level = sector, cells.z[c]
+            over = distance(cells.x[c], cells.y[c], level, plane)
+            is_over = over > CLEARLY_OFF * cells.tolerance[c] and level < origin[2]
+        if not is_over or sector == last_counted:
+            continue
+        r, z = cells.r[c], cells.z[c]
+        over = distance(cells.x[c], cells.y[c], z, plane)
         crosses = r * (origin[2] - level) < farthest * (origin[2] - z)
         if abs(z - level) <= cells.tolerance[c]:
             farthest = r
-        elif is_over and crosses and abs(over) <= cells.tolerance[c] and sector != last_counted:
+        elif crosses and abs(over) <= cells.tolerance[c]:
             n_sectors, last_counted = n_sectors + 1, sector
     return n_sectors
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, find_spec
+from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
 REFERENCE_HEIGHT = 1.0
@@ -61,4 +62,9 @@ def sensor_height_of(pose: SensorPose, sensor: SensorConfig) -> float:
 
 def is_seen_from_sensor(pose: SensorPose) -> bool:
     """Whether the ground is seen from where the sensor is taken to be, and not from elsewhere."""
-    return pose.measured is not None and pose.measured.plane.depression >= MIN_DEPRESSION
+    return pose.measured is not None and is_seen_steeply(pose.measured.plane)
+
+
+def is_seen_steeply(plane: GroundPlane) -> bool:
+    """Whether a plane is seen at an angle at which a sensor over it sees the nearest ground."""
+    return plane.depression >= MIN_DEPRESSION

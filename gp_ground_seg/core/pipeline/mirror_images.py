@@ -28,7 +28,7 @@ from gp_ground_seg.core.frame import (
 from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import SensorConfig
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane, crossed_at, tolerance_at
-from gp_ground_seg.core.pipeline.low_sensor import MIN_DEPRESSION
+from gp_ground_seg.core.pipeline.low_sensor import is_seen_from_sensor, is_seen_steeply
 from gp_ground_seg.core.pipeline.points import Direction
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
@@ -51,10 +51,10 @@ is wet: of dry scans the most was 0.07, of wet ones the least 0.14."""
 MIRRORED = 0.7
 """Share of what is deep below a mirror that is seen through returns on it: of dry scans the most
 was 0.57, of wet ones, but for those of rough ground, the least 0.81."""
-RING, LEAST_RANGE = 0.03, 0.1
+RING, LEAST_RANGE, N_BEHIND = 0.03, 0.1, 8
 """Width of the rings in which these returns are looked for, in parts of the range, and least range
 that is told [m]: in that where a ray to an image crosses the mirror or the next on either side,
-and in one of the next seven behind these."""
+and in one of those behind these, up to this number behind the first."""
 IsWet = Callable[[Candidates, float, float], bool]
 
 
@@ -90,7 +90,7 @@ def find_mirror_images(
     """
     none = MirrorImages(np.zeros(0, dtype=np.int64), np.zeros(0))
     x, y, up = (pose.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)).tolist()
-    if pose.measured is None or not can_mirror(pose.measured.plane, (x, y, up)):
+    if not is_seen_from_sensor(pose) or (x, y) != (0.0, 0.0):
         return none
     grid, plane_z = scan.grid, -pose.height
     if not (up > plane_z and is_wet(scan.candidates, plane_z, up)):
@@ -142,7 +142,7 @@ def is_mirror(plane: GroundPlane, scan: Scan, origin: Direction) -> bool:
     mirrored to, and it goes on behind. Rays below a table cross its plane where there is none; the
     land ends where rays pass over an edge. `origin` is where rays start [m].
     """
-    if not can_mirror(plane, origin):
+    if origin[:2] != (0.0, 0.0) or not is_seen_steeply(plane):
         return False
     grid, candidates = scan.grid, scan.candidates
     near = np.flatnonzero((candidates.r >= NEAREST) & (candidates.r < WET_REACH))
@@ -152,16 +152,17 @@ def is_mirror(plane: GroundPlane, scan: Scan, origin: Direction) -> bool:
         return False
     crossing = crossed_at(r[deep], over[deep], plane.below(*origin))
     # Points in no cell have no place on the plane: NaN, or a range beyond the last edge.
-    farthest = min(math.exp(9.0 * RING) * float(crossing.max()), float(grid.edges[-1]))
+    farthest = min(math.exp((N_BEHIND + 1) * RING) * float(crossing.max()), float(grid.edges[-1]))
     is_on_it = np.abs(plane.below(*scan.xyz.T)) <= tolerance_at(grid.r)
     on_it = np.flatnonzero(is_on_it & (grid.r < farthest))
     # Empty behind the last ring, and so before the first.
-    has_return = np.zeros((grid.n_segments, _ring_at(grid.edges[-1]) + 10), dtype=np.bool_)
+    n_rings = _ring_at(grid.edges[-1]) + N_BEHIND + 2
+    has_return = np.zeros((grid.n_segments, n_rings), dtype=np.bool_)
     has_return[grid.cell[on_it] // grid.n_bins, _ring_at(grid.r[on_it])] = True
     segment, ring = candidates.segment[near[deep]], _ring_at(crossing)
     beside, behind = (
         np.any([has_return[segment, ring + step] for step in steps], axis=0)
-        for steps in (range(-1, 2), range(2, 9))
+        for steps in (range(-1, 2), range(2, N_BEHIND + 1))
     )
     n_images = np.count_nonzero(beside & behind)
     return bool(n_images > max(WET_SHARE * n_ground, MIRRORED * len(crossing)))
@@ -170,11 +171,6 @@ def is_mirror(plane: GroundPlane, scan: Scan, origin: Direction) -> bool:
 def _ring_at(r: Values) -> Any:
     """Return the number of the ring at a range [m]; each is wider by `RING` than the last."""
     return (np.log(np.maximum(r, LEAST_RANGE) / LEAST_RANGE) / RING).astype(np.int64)
-
-
-def can_mirror(plane: GroundPlane, origin: Direction) -> bool:
-    """Whether rays start over the origin of the cloud, and meet the plane steeply enough."""
-    return origin[:2] == (0.0, 0.0) and plane.depression >= MIN_DEPRESSION
 
 
 @shared
