@@ -49,9 +49,11 @@ demo: $(VENV)/.ros
 
 # A test that hangs fails after so many seconds, with a traceback. Two processes share the modules.
 test: $(VENV)/.dev
+	$(BIN)/gp-ground-seg warm-up
 	$(WITH_KITTI) $(BIN)/python -m pytest -n 2 --dist loadfile --timeout=300 -m 'not slow'
 
 test-all: $(VENV)/.dev
+	$(BIN)/gp-ground-seg warm-up
 	$(WITH_KITTI) $(BIN)/python -m pytest --timeout=1500
 
 chromium:
@@ -60,7 +62,7 @@ chromium:
 		|| { echo 'Chromium is not installed: sudo apt-get install chromium-driver'; exit 1; }
 
 browser-test: $(VENV)/.dev chromium
-	$(BIN)/python -m pytest test/test_browser.py
+	$(BIN)/python -m pytest test/lab/test_browser.py
 
 torture: $(VENV)/.dev
 	$(BIN)/python test/torture.py

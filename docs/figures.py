@@ -9,7 +9,7 @@ else there is to say; what stands between the two is written here:
     <!-- end of figure -->
 
 sample: WORDS          further words for a run of seconds; its rows are kept in docs/samples.json,
-                       by command, and test/test_pages.py computes them again
+                       by command, and test/repo/test_pages.py computes them again
 keep: TITLE; TITLE     only the tables whose titles begin so
 drop: TITLE; TITLE     without the columns of these titles
 rows: PATTERN          only the rows in which this regular expression is found

@@ -107,7 +107,9 @@ def fewer(n: int, n_plain: int) -> int:
 
 @pytest.fixture(scope='module', params=[NumpyBackend, NumbaBackend], ids=['numpy', 'numba'])
 def backend(request: pytest.FixtureRequest) -> Backend:
-    """Each backend in turn; its buffers hold what the tests before left in them."""
+    """Each backend in turn."""
+    if request.param is NumbaBackend:
+        request.getfixturevalue('compiled_code')
     return request.param()
 
 
@@ -123,9 +125,9 @@ def likelihood(request):
     return request.param
 
 
-@pytest.fixture(scope='session', autouse=True)
+@pytest.fixture(scope='session')
 def compiled_code():
-    """Code compiled once for this checkout: nodes and commands of the tests load it."""
+    """Code compiled once for this checkout; for tests whose nodes and commands load it."""
     if JIT_ENABLED:
         warm_up()
 

@@ -135,6 +135,9 @@ def measure(clouds, rates, n_frames, ros_args=()):
         arrays, results = [], []
         session.node.create_subscription(DiagnosticArray, '/diagnostics', arrays.append, 10)
         Link(session, node).connect(clouds[0])
+        while not node.is_compiled() and 'runtime.backend:=numpy' not in ros_args:
+            session.sleep(0.2)
+            node.check()
         probe = Probe(session)
         for rate in rates:
             before = dropped_by_node(session, arrays)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -14,7 +16,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.bags import scan_cloud
-from gp_ground_seg.core.errors import in_thousands
+from gp_ground_seg.core.errors import GroundSegError, in_thousands
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud
 from gp_ground_seg.data.files import staged_files
@@ -39,6 +41,8 @@ LABELS = {GROUND: Label.GROUND, OBSTACLES: Label.OBSTACLE}
 """Label of what comes back on each topic."""
 PERIOD = 0.1
 """Shortest time from one scan to the next [s]."""
+LAST_LINES = 20
+"""Of the node's log, printed when the demo fails."""
 
 DESCRIPTION = f"""\
 Show the node at work without data: simulate a short drive along a street, write it as a bag,
@@ -90,10 +94,18 @@ class Tally:
         self.n_sent = self.n_back = 0
         self.counts = Counter[str]()
         self.latencies: list[float] = []
+        self.n_compiled = 0
 
-    def add(self, sent: CloudMessage, back: dict[str, CloudMessage], latency: float) -> None:
-        """Add a scan and what came back of it, `latency` [s] later."""
+    def add(
+        self,
+        sent: CloudMessage,
+        back: dict[str, CloudMessage],
+        latency: float,
+        is_compiled: bool,
+    ) -> None:
+        """Add a scan and what came back of it, `latency` [s] later, by compiled code or not."""
         self.latencies.append(latency)
+        self.n_compiled += is_compiled
         self.xyz = np.concatenate([read_xyz(cloud) for cloud in back.values()])
         parts = [np.full(cloud.width, LABELS[topic]) for topic, cloud in back.items()]
         self.label: Labels = np.concatenate(parts).astype(np.uint8)
@@ -114,6 +126,8 @@ class Tally:
             f'labels   ground IoU {iou}, precision {precision}, recall {recall} against the truth',
             f'latency  median {p50:.1f} ms, 99 % within {p99:.1f} ms, from sending a scan to '
             'having both clouds',
+            f'backend  numpy for {len(self.latencies) - self.n_compiled} scans, compiled code for '
+            f'{self.n_compiled}',
         ]
         if self.n_sent != self.n_back:
             lines.append('FAILED: each point must come back once; this is a bug')
@@ -132,8 +146,19 @@ def run(arguments: argparse.Namespace) -> int:
         NodeProcess(part / LOG, words) as node,
     ):
         _write(n_frames, part / BAG, session)
-        with BagReader(part / BAG) as bag:
-            tally, (xyz, label, truth) = _play(bag, n_frames, session, Link(session, node))
+        try:
+            with BagReader(part / BAG) as bag:
+                tally, (xyz, label, truth) = _play(bag, n_frames, session, node)
+        except GroundSegError as error:
+            print('the last lines of the log of the node:', *node.log_lines()[-LAST_LINES:],
+                  sep='\n  ', file=sys.stderr)  # fmt: skip
+            folder.mkdir(exist_ok=True)
+            for name in (BAG, LOG):
+                os.replace(part / name, folder / name)
+            raise GroundSegError(
+                f'{error}; {folder} has the bag and the log; try again with --force: what was '
+                'compiled is kept'
+            ) from error
         number = n_frames // 2 + 1
         title = f'Simulated street, scan {number} of {n_frames}'
         counts = plot_scan_view(xyz, label, part / PICTURE, title, truth=truth)
@@ -162,10 +187,11 @@ def _write(n_frames: int, path: Path, session: Session) -> None:
 
 
 def _play(
-    bag: BagReader, n_frames: int, session: Session, link: Link
+    bag: BagReader, n_frames: int, session: Session, node: NodeProcess
 ) -> tuple[Tally, tuple[npt.NDArray[np.floating], Labels, Labels]]:
     """Send the scans of a bag to the node; return their sums, and the labels of one scan."""
-    print('[2/3] connecting to the node, whose code is compiled at a first start', flush=True)
+    print('[2/3] connecting to the node', flush=True)
+    link = Link(session, node)
     link.connect(decode_cloud(next(bag.messages([TOPIC]))[2]))
     print('[3/3] sending the scans to the node, and receiving both clouds', flush=True)
     tally = Tally()
@@ -173,7 +199,7 @@ def _play(
         for k, (_, _, raw) in enumerate(bag.messages([TOPIC])):
             cloud, started = decode_cloud(raw), time.monotonic()
             back = link.ask(cloud)
-            tally.add(cloud, back, time.monotonic() - started)
+            tally.add(cloud, back, time.monotonic() - started, node.is_compiled())
             if k == n_frames // 2:
                 shown = tally.xyz, tally.label, tally.truth
             bar.update()

@@ -18,8 +18,6 @@ from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_s
 from gp_ground_seg.data.point_cloud2 import CloudMessage
 from gp_ground_seg.ros.start_stop import (
     CHANGED,
-    FOLLOWS,
-    STAYS,
     Session,
     child_command,
     large_cloud_transport,
@@ -29,7 +27,7 @@ from gp_ground_seg.ros.start_stop import (
 INPUT, GROUND, OBSTACLES = 'points', 'ground', 'obstacles'  # topics of the node
 OUTPUTS = (GROUND, OBSTACLES)
 PATIENCE = 60.0  # longest time that a cloud may take [s]
-START_TIMEOUT = 300.0  # time the node has to start, and to compile on a slow machine [s]
+START_TIMEOUT = 300.0  # time the node has to start, on a slow machine that does much else [s]
 
 _RUN = 'from gp_ground_seg.ros.start_stop import run_node; sys.exit(run_node(sys.argv[1:]))'
 
@@ -61,24 +59,20 @@ class NodeProcess:
         self._process.kill()  # does nothing to a process that has ended
         self._process.communicate()
 
-    def _said(self) -> str:
-        return self._log.read_text(encoding='utf-8', errors='replace')
+    def log_lines(self) -> list[str]:
+        """Return the lines of its output."""
+        return self._log.read_text(encoding='utf-8', errors='replace').splitlines()
 
-    def log_tail(self) -> str:
-        """Return the last lines of its output."""
-        return '\n'.join(self._said().splitlines()[-20:])
-
-    def is_settled(self) -> bool:
-        """Return whether it has the backend that it keeps."""
-        said = self._said()
-        return FOLLOWS not in said or CHANGED in said or STAYS in said
+    def is_compiled(self) -> bool:
+        """Return whether it segments with compiled code by now."""
+        return any(CHANGED in line for line in self.log_lines())
 
     def check(self) -> None:
         """Raise a GroundSegError if it has ended."""
         code = self._process.poll()
         if code is not None:
             ended = f'was killed by signal {-code}' if code < 0 else f'ended with code {code}'
-            raise GroundSegError(f'the node {ended}; its last words:\n{self.log_tail()}')
+            raise GroundSegError(f'the node {ended}')
 
 
 @contextlib.contextmanager
@@ -110,17 +104,23 @@ class Link:
             session.node.create_subscription(PointCloud2, topic, take, profile, raw=True)
 
     def connect(self, cloud: CloudMessage) -> None:
-        """Send a cloud until the node answers, and has the backend that it keeps."""
+        """Send a cloud until the node answers.
+
+        A cloud that is sent before DDS has connected both sides is lost. Each time the node has
+        twice as long to answer: it shares the processor with its compiler, and each cloud that is
+        sent again is work for it.
+        """
         first = with_stamp(cloud, (1, 0))
-        end = time.monotonic() + START_TIMEOUT
-        while self._ask(first, 0.2) is None or not self._node.is_settled():
+        patience, end = 0.5, time.monotonic() + START_TIMEOUT
+        while self._ask(first, patience) is None:
             if time.monotonic() > end:
-                raise GroundSegError(self._silence(START_TIMEOUT))
+                raise GroundSegError(_silence(START_TIMEOUT))
+            patience *= 2.0
 
     def ask(self, cloud: CloudMessage) -> dict[str, CloudMessage]:
         """Send a cloud; return what the node makes of it, by topic."""
         if (found := self._ask(cloud, PATIENCE)) is None:
-            raise GroundSegError(self._silence(PATIENCE))
+            raise GroundSegError(_silence(PATIENCE))
         return found
 
     def _ask(self, cloud: CloudMessage, patience: float) -> dict[str, CloudMessage] | None:
@@ -137,7 +137,6 @@ class Link:
         cloud = decode_cloud(raw)
         self._back.setdefault(stamp_of(cloud), {})[topic] = cloud
 
-    def _silence(self, seconds: float) -> str:
-        topics = ' and '.join(OUTPUTS)
-        said = self._node.log_tail()
-        return f'no answer on {topics} within {seconds:g} s; the node said last:\n{said}'
+
+def _silence(seconds: float) -> str:
+    return f'no answer on {" and ".join(OUTPUTS)} within {seconds:g} s'

@@ -105,7 +105,7 @@ def test_the_installed_node_runs_as_ros2_run_starts_it(workspace, tmp_path):
 def test_colcon_test_collects_our_tests(workspace):
     """It returns 0 as well where it finds none."""
     # Those that need no compiled code, which would be compiled for it.
-    tests = '--pytest-args', 'test/test_package.py', 'test/test_config.py'
+    tests = '--pytest-args', 'test/repo/test_package.py', 'test/core/test_config.py'
     words = '--return-code-on-test-failure', *tests
     done = colcon(workspace, 'test', *words, NUMBA_DISABLE_JIT='1')
     assert done.returncode == 0, done.stdout + done.stderr

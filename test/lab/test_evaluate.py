@@ -26,6 +26,8 @@ from gp_ground_seg.lab.scoring.evaluate import KEYS, OurMethod, each, make_score
 from gp_ground_seg.lab.scoring.metrics import COUNTS, label_ratios
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 
 def evaluate(root, *methods, **options):
     return runner.score_methods(labelled_frames(root), methods, **options)

@@ -13,6 +13,8 @@ from conftest import REPOSITORY, load_script
 
 from gp_ground_seg.core.parameters.removed import REMOVED
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 FILE = REPOSITORY / 'launch' / 'ground_segmentation.launch.py'
 PAGE = (REPOSITORY / 'docs' / 'node.md').read_text(encoding='utf-8')
 (EXAMPLE,) = re.findall(r'```python\n(from launch import .*?)```', PAGE, re.DOTALL)

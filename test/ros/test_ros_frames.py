@@ -15,10 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nav_msgs.msg import OccupancyGrid
 from rclpy.time import Time
+from rooms import ROOM
 from ros_helpers import bench, street, to_message, wait_for, xyz_of
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu, LaserScan
-from test_sensor_pose import ROOM
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
@@ -27,6 +27,8 @@ from gp_ground_seg.lab.simulation import VLP_16, simulate_scan
 from gp_ground_seg.ros import transforms
 from gp_ground_seg.ros.ground_model import read_ground_model
 from gp_ground_seg.ros.transforms import rotation_of
+
+pytestmark = pytest.mark.usefixtures('compiled_code')
 
 HAS_TF2 = importlib.util.find_spec('tf2_ros') is not None
 VALUES = {'learning.mode': 'fixed', 'sensor.height': 1.73}

@@ -23,6 +23,8 @@ from gp_ground_seg.lab.tuner import (
     tunable,
 )
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 CAR = 10 | 7 << 16  # class of SemanticKITTI, and an instance of it
 
 

@@ -19,6 +19,8 @@ from gp_ground_seg.cli.options import library_notes
 from gp_ground_seg.core.parameters.removed import PROGRAM, REMOVED
 from gp_ground_seg.lab.simulation import SCENES
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 HEAVY = {'numba', 'scipy', 'matplotlib', 'pandas', 'rosbags', 'rclpy'}
 
 

@@ -20,6 +20,8 @@ from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.core.pipeline.sensor_pose import LITTLE_GROUND, NO_HEIGHT
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 OFTEN = '-p', 'diagnostics.period:=0.1'
 
 

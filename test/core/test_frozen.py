@@ -1,6 +1,6 @@
 """Labels and p_ground of the 60 labelled frames, as they were when `frozen.json` was written.
 
-`python test/test_frozen.py` writes it anew, after a change that is meant to change results.
+`python test/core/test_frozen.py` writes it anew, after a change that is meant to change results.
 """
 
 import hashlib
@@ -14,6 +14,8 @@ from conftest import find_kitti
 
 from gp_ground_seg import Config, GroundSegmenter, Segmentation
 from gp_ground_seg.data.semantic_kitti import read_points
+
+pytestmark = pytest.mark.usefixtures('compiled_code')
 
 FROZEN = Path(__file__).with_name('frozen.json')
 SAME_P_GROUND = 1e-5

@@ -25,6 +25,8 @@ from gp_ground_seg.core.gp.evidence import STEP
 from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.jit import HAVE_NUMBA, JIT_ENABLED
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 # Without compilation the twins take a microsecond for each cell and point.
 SIZE = {} if JIT_ENABLED else {'grid.n_segments': 36, 'grid.n_bins': 60, 'grid.bin_growth': 1.5}
 CONFIG = Config().replace(**SIZE)

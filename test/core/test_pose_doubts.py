@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 import pytest
+from rooms import ROOM
 from test_sensor_pose import (
-    ROOM,
     SEGMENTER,
     SENSORS,
     SMALL_HDL,

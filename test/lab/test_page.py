@@ -18,7 +18,7 @@ import viser
 import zstandard
 from websockets.sync.client import connect
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('compiled_code')]
 
 PATIENCE = 60.0
 VERSION = f'viser-v{viser.__version__}'

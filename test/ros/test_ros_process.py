@@ -19,6 +19,8 @@ from sensor_msgs.msg import LaserScan, PointCloud2
 
 from gp_ground_seg.ros.input import NO_TIME, SequenceGaps
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 # A busy machine must not look like a fault.
 CHANGES = {
     'diagnostics.period': 0.2, 'diagnostics.max_latency': 10.0, 'diagnostics.stale_after': 60.0,
@@ -275,7 +277,7 @@ def test_gaps_of_two_publishers_add_up(steps, are_near):
 # Sends best-effort clouds of 1.9 MB until it is ended; its domain is that of the environment.
 DRIVER = f"""
 import sys, time
-sys.path.insert(0, {str(Path(__file__).parent)!r})
+sys.path.insert(0, {str(Path(__file__).parents[1])!r})
 import rclpy
 from ros_helpers import BEST_EFFORT, PointCloud2, street, to_message
 rclpy.init()

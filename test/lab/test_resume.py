@@ -17,6 +17,8 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data import files
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 
 @pytest.fixture(scope='module')
 def root(tmp_path_factory):

@@ -25,6 +25,8 @@ from gp_ground_seg.ros.diagnostics import (
 )  # fmt: skip
 from gp_ground_seg.ros.input import JUMP_TOLERANCE, TimeJumps
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 LIMITS = DiagnosticsConfig(stale_after=2.0, max_latency=0.1)
 FACTS = InputFacts('/points', 'reliable, keep_last 1, volatile', n_publishers=1, ros_time=1000.5)
 

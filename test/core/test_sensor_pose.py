@@ -1,7 +1,6 @@
 """Height and tilt of the sensor from one scan: found, applied, refused, contradicted."""
 
 import dataclasses
-import itertools
 import math
 
 import numpy as np
@@ -9,6 +8,7 @@ import pytest
 from conftest import fewer
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rooms import HALL, ROOM, SMALL_ROOM, room
 from test_ground_plane import cluttered_plane
 
 from gp_ground_seg import Config, GroundSegmenter, PointCloudError
@@ -21,7 +21,6 @@ from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_
 from gp_ground_seg.lab import simulation
 from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, SCENES, VLP_16, Scene, simulate_scan
 from gp_ground_seg.lab.simulation import terrain as landforms
-from gp_ground_seg.lab.simulation.objects import floating_box, wall
 
 # Scans of 100,000 points, too many for the compiled twins as plain Python.
 BACKEND = NumbaBackend() if JIT_ENABLED else NumpyBackend()
@@ -102,18 +101,6 @@ def test_a_cluttered_plane_is_recovered(seed, height, roll, pitch, yaw):
     assert dataclasses.replace(other, measured=None) == dataclasses.replace(pose, measured=None)
 
 
-def room(name, ends, ceiling=False):
-    ground = landforms.flat()
-    solids = [s for a, b in itertools.pairwise([*ends, ends[0]]) for s in wall(ground, a, b, 3.0)]
-    if ceiling:
-        solids.append(floating_box(ground, 2.0, 1.0, (20.0, 12.0, 0.2), 3.0))
-    return Scene(name, ground, tuple(solids))
-
-
-HALL = room('hall', [(-8.0, -5.0), (12.0, -5.0), (12.0, 7.0), (-8.0, 7.0)], ceiling=True)
-ROOM, SMALL_ROOM = (
-    room('room', [(-a, -a), (a, -a), (a, a), (-a, a)], ceiling=True) for a in (5.0, 4.5)
-)
 MID_360 = simulation.SENSORS['mid-360']
 
 

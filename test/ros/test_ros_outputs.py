@@ -21,6 +21,8 @@ from gp_ground_seg.ros.ground_model import read_ground_model
 from gp_ground_seg.ros.outputs import LABELLED_FIELDS as FIELDS
 from gp_ground_seg.ros.outputs import labelled_names
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 OPTIONAL = {
     '~/labeled': PointCloud2, '~/ground_model': PointCloud2,
     '~/scan': LaserScan, '~/occupancy': OccupancyGrid,

@@ -24,6 +24,8 @@ from gp_ground_seg.data.clouds import cloud_of, gather, name_columns
 from gp_ground_seg.data.pcd import PcdHeader
 from gp_ground_seg.data.ply import PlyHeader
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 lzf = pytest.importorskip('lzf', reason='needs the extra formats')
 
 CODES = ['i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'f4', 'f8']

@@ -17,6 +17,7 @@ pytest.importorskip('viser', reason='viser is not installed')
 webdriver = pytest.importorskip('selenium.webdriver', reason='selenium is not installed')
 DRIVER = shutil.which('chromedriver')
 pytestmark = [
+    pytest.mark.usefixtures('compiled_code'),
     pytest.mark.skipif(DRIVER is None, reason='chromedriver is not installed'),
     pytest.mark.slow,
 ]

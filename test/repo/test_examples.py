@@ -12,6 +12,8 @@ from evaluation_samples import write_streets
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, semantic_kitti
 from gp_ground_seg.core.errors import DataError
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 
 def test_labels_are_scored_by_presets(tmp_path, capsys):
     load_script('examples/score_my_labels.py').main(write_streets(tmp_path, s00=1, s08=1), '00')

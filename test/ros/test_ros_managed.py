@@ -18,6 +18,8 @@ from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.ros.start_stop import FOLLOWS
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 START = (
     '-c', 'import sys; from gp_ground_seg.cli.node import main_managed; sys.exit(main_managed())',
 )  # fmt: skip

@@ -19,6 +19,8 @@ from gp_ground_seg.core.parameters.config import PRESETS, find_spec, parameter_s
 from gp_ground_seg.core.parameters.removed import REMOVED
 from gp_ground_seg.ros.start_stop import CHANGED
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 TYPES = {
     bool: ParameterType.PARAMETER_BOOL,
     int: ParameterType.PARAMETER_INTEGER,

@@ -22,6 +22,8 @@ from gp_ground_seg.core.parameters.config import size_of_tables
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.files import staged_bag_folder
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 
 def ring_scan(n=4000, seed=0, height=1.73):
     """Level ground about the sensor."""
@@ -221,7 +223,10 @@ def test_a_frame_takes_the_memory_of_the_last():
         'print((faults() - before) // 5)\n'
     )
     here = Path(__file__).parent
-    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join([str(here.parent), str(here)])}
+    environment = {
+        **os.environ,
+        'PYTHONPATH': os.pathsep.join(map(str, [*here.parents[:2], here])),
+    }
     command = [sys.executable, '-c', script]
     found = subprocess.run(command, check=True, env=environment, timeout=120, capture_output=True)
     # A scan has 2 MB, or 500 pages; of those that are freed 6,000 came back as new ones.

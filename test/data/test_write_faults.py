@@ -26,6 +26,8 @@ from gp_ground_seg.cli import tune
 from gp_ground_seg.core import jit
 from gp_ground_seg.data.bags import BagReader
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 FULL, BROKEN, PARTLY = errno.ENOSPC, errno.EIO, None
 NUMPY = ['--set', 'runtime.backend=numpy']
 

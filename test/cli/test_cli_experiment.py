@@ -29,6 +29,8 @@ from gp_ground_seg.lab.simulation import (
     simulate_scan,
 )
 
+pytestmark = pytest.mark.usefixtures('compiled_code')
+
 
 @pytest.fixture(scope='module')
 def root(tmp_path_factory):

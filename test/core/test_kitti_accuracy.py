@@ -1,10 +1,13 @@
 """Regression on real frames: scores of the defaults must not fall."""
 
 import numpy as np
+import pytest
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_labels, read_points
 from gp_ground_seg.lab.scoring import evaluate as runner
+
+pytestmark = pytest.mark.usefixtures('compiled_code')
 
 GROUND_CLASSES = [40, 44, 48, 49, 60, 72]
 LEFT_OUT = [0, 1, 70]
