@@ -1,4 +1,4 @@
-# make demo | make test | make test-all | make browser-test | make bench | make node-bench | make colcon | make lint | make docs: each creates the environment it needs.
+# make demo | make test | make test-all | make browser-test | make bench | make node-bench | make colcon | make dist | make lint | make docs: each creates the environment it needs.
 PYTHON ?= python3
 # Not the .venv of README: two ways of installation in one environment get in each other's way.
 VENV ?= .venv-dev
@@ -7,7 +7,7 @@ KITTI ?= $(abspath $(wildcard ../shared/kitti))
 # Empty, the variable would be a path to the tests.
 WITH_KITTI := $(if $(KITTI),GP_GROUND_SEG_KITTI=$(KITTI))
 
-.PHONY: help demo test test-all chromium browser-test torture bench figures docs node-bench colcon lint format generate clean
+.PHONY: help demo test test-all chromium browser-test torture bench figures docs node-bench colcon dist lint format generate clean
 
 help:
 	@echo 'make demo      a synthetic drive through the node: score, latency and a picture'
@@ -20,7 +20,8 @@ help:
 	@echo 'make docs      the documentation as HTML, in build/docs'
 	@echo 'make node-bench  latency and losses of the node over DDS'
 	@echo 'make colcon    colcon build and colcon test (PYTEST_ARGS=... for some tests)'
-	@echo 'make lint      ruff, mypy, import-linter and codespell'
+	@echo 'make dist      the wheel, built, installed and used outside the repository'
+	@echo 'make lint      ruff, mypy, import-linter, codespell, and the limits of size'
 	@echo 'make format    format the code'
 	@echo 'make generate  rewrite the tables of README, config/ and docs/parameters.md'
 	@echo 'make clean     remove the environment and build results'
@@ -95,6 +96,22 @@ lint: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/codespell
+	$(BIN)/python -m flake8 --config=test/ament_flake8.ini gp_ground_seg test setup.py
+	$(BIN)/python -m pydocstyle --convention=numpy --add-ignore=D100,D101,D102,D103,D104,D105,D106,D107,D404 \
+		--match='.*\.py' gp_ground_seg setup.py
+	$(BIN)/python scripts/ratchet.py
+
+# What goes to PyPI: built from the sdist, looked at by twine, installed and used outside this repository.
+dist: $(VENV)/.dev
+	rm -rf build/dist && mkdir -p build/dist/empty
+	$(BIN)/python -m pip wheel -q --no-deps --no-build-isolation -w build/dist \
+		$$($(BIN)/python setup.py -q sdist -d build/dist && ls -d $(CURDIR)/build/dist/*.tar.gz)
+	$(BIN)/python -m twine check --strict build/dist/*.whl build/dist/*.tar.gz
+	$(BIN)/python -m pip install -q --no-deps --target build/dist/site build/dist/*.whl
+	cd build/dist/empty && PYTHONPATH=../site NUMBA_DISABLE_JIT=1 $(abspath $(BIN))/python -m gp_ground_seg \
+		plot scan $(CURDIR)/docs/scans/vls128_street.npz --set runtime.backend=numpy -o scan.png
+	cd build/dist/empty && PYTHONPATH=../site $(abspath $(BIN))/python -c 'import gp_ground_seg as g; assert "/site/" in g.__file__'
+	ls build/dist/site/share/gp_ground_seg/config/fastdds_large_clouds.xml build/dist/empty/scan.png
 
 format: $(VENV)/.dev
 	$(BIN)/ruff check --fix .

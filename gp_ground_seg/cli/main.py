@@ -8,23 +8,18 @@ import importlib
 import io
 import logging
 import os
-import re
 import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from typing import NoReturn
 
 from gp_ground_seg import __version__
 from gp_ground_seg.core.errors import GroundSegError, in_one_line, reason_of, shown
-from gp_ground_seg.core.parameters.removed import removal_of_words
 from gp_ground_seg.core.parameters.schema import did_you_mean
 
 ROS_ARGS = '--ros-args'
-OF_ROS = ('-r', '--remap', '-p', '--param', '--params-file', '--log-level')
-"""Options that ROS reads, behind `ROS_ARGS`."""
 COLLECT_AFTER = 50_000
 """New objects after which Python looks for garbage: compiling makes a million that stay, and with
 the usual 700 a tenth of its time goes into the search."""
@@ -36,7 +31,7 @@ the usual 700 a tenth of its time goes into the search."""
 COMMANDS = {
     'node': ('node', 'run the ROS 2 node'),
     'warm-up': ('node', 'compile the code before the first start'),
-    'config': ('config', 'write, check and compare parameter files'),
+    'config': ('config', 'write and check parameter files'),
     'play': ('bags', "publish a bag's clouds as they were recorded"),
     'demo': ('demo', 'show the node at work, no data needed'),
     'kitti-to-bag': ('bags', 'write a KITTI sequence as a rosbag2'),
@@ -46,8 +41,6 @@ COMMANDS = {
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
 }
-FILE_COMMANDS = {'plot': 'scan', 'config': 'check'}
-"""Of the commands below a command, which is meant where a file stands in its place."""
 GROUPS = {'robot': 'node', 'files': 'segment', 'laboratory': 'evaluate'}
 """Groups of commands in the help, each with its first command."""
 
@@ -72,66 +65,12 @@ def _grouped_commands() -> str:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, the same with every version of Python."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.options: dict[str, argparse.Action] = {}
-        self.commands: dict[str, argparse.ArgumentParser] = {}
-        super().__init__(*args, **kwargs)
-
-    def add_argument(self, *args: Any, **kwargs: Any) -> argparse.Action:
-        """Note the names of an option."""
-        action = super().add_argument(*args, **kwargs)
-        self.options.update(dict.fromkeys(action.option_strings, action))
-        return action
-
-    def add_subparsers(self, **kwargs: Any) -> Any:
-        """Note the commands below this one."""
-        subparsers = super().add_subparsers(**kwargs)
-        self.commands = subparsers.choices
-        return subparsers
+    """Raises what is wrong with the words as a GroundSegError of one line."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise a GroundSegError, which names the help if the message has no next step."""
-        has_step = 'must be' in message or 'did you mean' in message
+        """Raise a GroundSegError, which names the help."""
         parts = [self.prog.partition(' ')[2], message.removeprefix('argument ')]
-        hint = '' if has_step else f'; {self.prog} --help lists what it takes'
-        raise GroundSegError(': '.join(filter(None, parts)) + hint)
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Refuse what is no command, and, in the parser of the last one, what it does not take."""
-        words = sys.argv[1:] if args is None else args
-        command = next((word for word in words if not word.startswith('-')), None)
-        if self.commands and command is not None and command not in self.commands:
-            self._refuse_command(command)
-        arguments, unknown = super().parse_known_args(words, namespace)
-        if unknown and not self.commands:
-            hint = self._hint_at(unknown[0], words)
-            self.error(f'unrecognized arguments: {" ".join(unknown)}{hint}')
-        return arguments, unknown
-
-    def _refuse_command(self, word: str) -> NoReturn:
-        """Say which command below this one a word may mean that is none."""
-        file_command = FILE_COMMANDS.get(self.prog.split()[-1])
-        if word and file_command and (Path(word).suffix or Path(word).exists()):
-            self.error(f'{word}: no command; did you mean {self.prog} {file_command} {word}?')
-        names = ', '.join(self.commands)
-        self.error(f'{word!r}: must be one of {names}{did_you_mean(word, self.commands)}')
-
-    def _hint_at(self, word: str, words: Sequence[str]) -> str:
-        """Say what may be meant by one of the words, which is not taken."""
-        if word in OF_ROS and self.get_default('accepts_ros_args'):
-            return f'; did you mean {ROS_ARGS} {word}?'
-        if word.startswith('-'):
-            return did_you_mean(word.partition('=')[0], self.options) if word[1:2] == '-' else ''
-        # Of a list with spaces only the first word belongs to its option.
-        *_, option = ['', *(w for w in words[: words.index(word)] if w.startswith('-'))]
-        is_list = {name: re.search('LIST|,', f'{a.metavar}') for name, a in self.options.items()}
-        if option and any(is_list[name] for name in is_list if name.startswith(option)):
-            first, second = words[words.index(option) + 1 :][:2]
-            given = f'{option} {first.strip(",")},{second}'
-            return f'; the list must be without spaces, as in {given}'
-        return ''
+        raise GroundSegError(f'{": ".join(filter(None, parts))}; {self.prog} --help explains it')
 
 
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:
@@ -163,15 +102,19 @@ def _parse(words: list[str]) -> argparse.Namespace:
     """Parse the words before ``--ros-args``; it and what follows is ROS's to read."""
     n_before = words.index(ROS_ARGS) if ROS_ARGS in words else len(words)
     command = next((word for word in words[:n_before] if not word.startswith('-')), None)
-    if removed := removal_of_words(words[:n_before]):
-        raise GroundSegError(removed)
     if command not in (None, *COMMANDS):
         hint = did_you_mean(command or '', COMMANDS) or '; --help lists them'
         raise GroundSegError(f'{command}: no such command{hint}')
-    parser = build_parser(command if command in COMMANDS else None)
-    arguments = parser.parse_args(words[:n_before])
+    arguments, unknown = build_parser(command).parse_known_args(words[:n_before])
+    takes_ros_args = getattr(arguments, 'accepts_ros_args', False)
+    if unknown:
+        hint = f'{ROS_ARGS} before what ROS reads, or ' if takes_ros_args else ''
+        raise GroundSegError(
+            f'{command}: unrecognized arguments: {" ".join(unknown)}; '
+            f'try {hint}gp-ground-seg {command} --help'
+        )
     arguments.ros_args = words[n_before:]
-    if arguments.ros_args and not getattr(arguments, 'accepts_ros_args', False):
+    if arguments.ros_args and not takes_ros_args:
         raise GroundSegError(f'{command}: {ROS_ARGS}: this command takes none')
     return arguments
 
@@ -219,22 +162,10 @@ def _interruptible() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-def _prepare_streams() -> None:
-    """Open the null device for standard streams that are closed; escape what they cannot hold.
-
-    `print` to a closed stderr would go to stdout, and the next file opened would be the stream.
-    """
-    for name in ('stdin', 'stdout', 'stderr'):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, 'r' if name == 'stdin' else 'w'))  # noqa: SIM115
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors='backslashreplace')
-
-
-def _abandon(stream: TextIO) -> None:
-    """Send the rest of a standard stream nowhere, so that Python does not fail on it at exit."""
+def _abandon_stdout() -> None:
+    """Send the rest of standard output nowhere, so that Python does not fail on it at exit."""
     with suppress(OSError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _run(words: list[str]) -> int:
@@ -247,7 +178,7 @@ def _run(words: list[str]) -> int:
             with _notes(arguments):
                 code: int = arguments.run(arguments)
     finally:
-        sys.stdout.flush()  # also behind --help, which ends by SystemExit
+        print(end='', flush=True)  # also after --help, which ends by SystemExit
     return code
 
 
@@ -256,42 +187,28 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     It is that of the command, 2 after an error, which takes one line, or 130 when interrupted.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
-    _prepare_streams()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors='backslashreplace')  # names of files need not be UTF-8
     try:
-        return _code_of(words)
-    finally:
-        try:
-            sys.stderr.flush()
-        except OSError:  # it is full: what it still holds would make the exit code 120
-            _abandon(sys.stderr)
-
-
-def _code_of(words: list[str]) -> int:
-    """Run the command, say in one line what is wrong, and return the exit code."""
-    code = 2
-    try:
-        return _run(words)
-    except BrokenPipeError:
-        # The reader of our output went away (as in `| head`); nothing is wrong here.
-        _abandon(sys.stdout)
+        return _run(list(sys.argv[1:] if argv is None else argv))
+    except BrokenPipeError:  # the reader of our output went away, as `| head` does
+        _abandon_stdout()
         return 0
     except GroundSegError as error:
-        line = f'error: {error}'
+        line = str(error)
     except OSError as error:
-        _abandon(sys.stdout)
-        line = f'error: {error.filename or "input or output"}: {reason_of(error)}'
+        _abandon_stdout()
+        line = f'{error.filename or "input or output"}: {reason_of(error)}'
     except UnicodeError as error:
-        line = f'error: {in_one_line(error)}: a name or text is not UTF-8'
+        line = f'{in_one_line(error)}: a name or text is not UTF-8'
     except MemoryError:
-        line = 'error: not enough memory for this input'
-    except KeyboardInterrupt:
-        line, code = 'interrupted', 130
-    except RuntimeError as error:
-        # Of `Path.resolve`, before Python 3.13.
+        line = 'not enough memory for this input'
+    except RuntimeError as error:  # of `Path.resolve`, before Python 3.13
         if not str(error).startswith('Symlink loop'):
             raise
-        line = f'error: {error}'
-    with suppress(OSError):  # standard error may be full
-        print(f'gp-ground-seg: {shown(line)}', file=sys.stderr)
-    return code
+        line = str(error)
+    except KeyboardInterrupt:
+        print('gp-ground-seg: interrupted', file=sys.stderr)
+        return 130
+    print(f'gp-ground-seg: error: {shown(line)}', file=sys.stderr)
+    return 2

@@ -266,29 +266,9 @@ def count(number: int, noun: str) -> str:
 
 
 def progress(title: str, *, quiet: bool = False, unit: str = 'frame') -> partial[tqdm[Any]]:
-    """Progress of items, or of a `total`, on standard error: a bar, or lines if it is a file."""
-    own = {'desc': title, 'unit': unit, 'file': sys.stderr, 'disable': quiet, 'leave': False}
-    if sys.stderr.isatty():
-        return partial(tqdm, **own)
-    period = LINE_PERIOD
-    return partial(_Lines, **own, mininterval=period, maxinterval=period, delay=period)
-
-
-class _Lines(tqdm):  # type: ignore[type-arg]
-    """Progress as a line every `LINE_PERIOD`, none of a run that is shorter."""
-
-    def display(self, msg: str | None = None, pos: int | None = None) -> None:
-        """Write a line."""
-        if msg is None:
-            facts = self.format_dict
-            total = f' of {facts["total"]}' if facts['total'] else ''
-            left = self.format_meter(**{**facts, 'bar_format': '{remaining}'})
-            elapsed = self.format_interval(facts['elapsed'])
-            done = f'{facts["n"]}{total} {facts["unit"]}s'
-            sys.stderr.write(f'{facts["prefix"]}: {done}, {elapsed} gone, {left} left\n')
-            sys.stderr.flush()
-
-    def close(self) -> None:
-        """End; there is no bar to clear."""
-        self.delay = math.inf
-        super().close()
+    """Progress of items, or of a `total`, on standard error; in a file every half minute."""
+    period = 0.1 if sys.stderr.isatty() else LINE_PERIOD
+    waits = {'mininterval': period, 'maxinterval': max(10.0, period), 'delay': period}
+    return partial(
+        tqdm, desc=title, unit=unit, file=sys.stderr, disable=quiet, leave=False, **waits
+    )

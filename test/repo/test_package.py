@@ -199,3 +199,24 @@ def test_a_warning_is_an_error_in_tests_and_not_where_plugins_are_imported(tmp_p
         env={**os.environ, 'PYTHONPATH': path, 'NUMBA_DISABLE_JIT': '1', 'PYTEST_ADDOPTS': ''},
     )  # fmt: skip
     assert done.returncode == 1 and 'DeprecationWarning: late' in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize(
+    ('words', 'complaint'),
+    [
+        ((), 'no ROS 2: source /opt/ros/jazzy/setup.bash'),
+        (('src',), 'src has no src: name the workspace, or start this in it'),
+        (('elsewhere',), 'elsewhere: no such folder'),
+    ],
+)
+def test_the_script_for_a_workspace_refuses_in_one_line(tmp_path, words, complaint):
+    (tmp_path / 'src').mkdir()
+    script = REPOSITORY / 'scripts' / 'setup_workspace.sh'
+    done = subprocess.run(
+        [script, *words], cwd=tmp_path, env={'PATH': os.environ['PATH']},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith('setup_workspace.sh: error: ') and line.endswith(complaint)
+    assert [path.name for path in tmp_path.rglob('*')] == ['src']
