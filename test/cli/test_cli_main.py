@@ -45,11 +45,11 @@ def test_a_misspelt_command_is_one_line(word, hint, capsys):
     ('line', 'said'),
     [
         ('play BAG --xyz', 'play: unrecognized arguments: --xyz; {}{help play}'),
-        ('evaluate R --sequences 00 08', 'evaluate: unrecognized arguments: 08; try {help evaluate}'),
+        ('evaluate R --sequences 0 8', 'evaluate: unrecognized arguments: 8; try {help evaluate}'),
         ('node -r a:=/x', 'node: unrecognized arguments: -r a:=/x; try --ros-args before {}'),
         ('demo --ros-args -r a:=b', 'demo: --ros-args: this command takes none'),
-        ('config dmp', "config: WHAT: invalid choice: 'dmp' (choose from {})"),
-        ('plot a.pcd -o b', "plot: PICTURE: invalid choice: 'a.pcd' (choose from {})"),
+        ('config dmp', "config: WHAT: invalid choice: 'dmp' (choose from {}"),
+        ('plot a.pcd -o b', "plot: PICTURE: invalid choice: 'a.pcd' (choose from {}"),
         ('plot segment A -o B --segment 1,',
          "plot segment: --segment: '1,': must be whole numbers, as in 157,158; {}"),
         ('experiment scenes --scenes flt', "experiment scenes: --scenes: 'flt': must be some of {}"
