@@ -28,7 +28,7 @@ help:
 
 $(VENV)/.python:
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'pip>=23.2' wheel
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile 'pip>=23.2' wheel
 	@touch $@
 
 $(VENV)/.ros: setup.py $(VENV)/.python
