@@ -23,7 +23,6 @@ from gp_ground_seg.core.backend import Backend, make_backend
 from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_errors
 from gp_ground_seg.core.gp.learning import Learned
-from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.parameters.schema import NO_BOX
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
@@ -392,7 +391,6 @@ def warm_up(config: Config | None = None) -> Backend:
     wall = xyz[25] + [0.0, 0.0, 1.0]
     points = np.concatenate([xyz.reshape(-1, 3), wall]).astype(np.float32)
     segmenter.segment(points)
-    keep_code()
     return segmenter.backend
 
 
