@@ -317,7 +317,8 @@ def test_each_call_that_keeps_compiled_code_fails_in_turn(tmp_path):
     if not jit.HAVE_NUMBA:
         pytest.skip('nothing is compiled')
     (tmp_path / 'double.py').write_text(DOUBLE)
-    paths = [str(REPOSITORY), str(REPOSITORY / 'test'), str(Path(__file__).parent), str(tmp_path)]
+    tests = REPOSITORY / 'test'
+    paths = map(str, [REPOSITORY, tests, tests / 'data', tmp_path])
     changed = {'PYTHONPATH': os.pathsep.join(paths), 'NUMBA_DISABLE_JIT': '0'}
     command, pipes = [sys.executable, '-c', COMPILE], {'stdin': subprocess.PIPE}
     pipes |= {'stdout': subprocess.PIPE, 'stderr': subprocess.DEVNULL}
