@@ -46,11 +46,7 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
 
 def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
     """Return `config` with those of the `parameters` that it declares, if they are accepted."""
-    values = {
-        parameter.name: find_spec(parameter.name).check(parameter.value)
-        for parameter in parameters
-        if parameter.name in _NAMES
-    }
+    values = {given.name: given.value for given in parameters if given.name in _NAMES}
     return config.replace(**values)
 
 
