@@ -133,7 +133,7 @@ class GroundSegmenter:
             does not show the ground well, its height, and its angles where they are auto.
         box_frame : tuple of float arrays, optional
             Rotation (3, 3) and translation (3,) [m] from the frame of this scan into that of
-            ``input.crop_box``; by default they are one.
+            ``input.crop_box``; by default the box is in the frame of this scan.
 
         Raises
         ------
