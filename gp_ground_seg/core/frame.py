@@ -29,7 +29,7 @@ Values = Any
 OUTSIDE = -1
 """Bin, cell and tile of a point that is beyond the grid."""
 NOT_FINITE = -2
-"""Cell of a point that is not finite; what is no return has become so."""
+"""Cell of a point with NaN or infinity. `take_points` sets points without a return to NaN."""
 
 
 def as_index(places: CellArray) -> IntArray:

@@ -1,9 +1,9 @@
 """The one policy for code compiled with numba, which is optional, and for keeping it on disk.
 
-numba keeps compiled code itself (``cache=True``), here in a folder of the user whose name is a
-digest of our sources and of versions: code of other sources is never read. An entry that does not
-fit its checksum, as after a power cut, is compiled again. Processes that use a folder hold a lock
-on it: what another one has just compiled is not yet noted, and must not be taken for damaged.
+Each compiled function has a file of its own, with a checksum, in a folder of the user whose name
+is a digest of our sources and of versions: code of other sources is never read. A file that does
+not fit its checksum, as after a power cut, is compiled again. Of several processes one compiles a
+function, and the others wait for its file.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import fcntl
 import functools
 import hashlib
 import importlib.util
-import json
 import logging
 import os
-import shutil
+import pickle
 import stat
 import sys
+import time
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
@@ -37,9 +37,11 @@ _Function = TypeVar('_Function', bound=Callable[..., Any])
 _CORE = Path(__file__).parent
 _entry_points: list[Any] = []
 _shared: list[Callable[..., Any]] = []
-_KEPT, _LOCK = 'kept.json', 'lock'
-_is_warm = _is_missing = _is_not_kept = False
-_n_ready = _n_kept = 0
+_ALL, _LOCK = 'all', 'lock'
+_CHECKSUM_SIZE = hashlib.sha256().digest_size
+_is_not_kept = False
+_turn: int | None = None  # file descriptor of the lock, while this process compiles
+_patience = 120.0  # how long to wait for others, in all [s]: one may be suspended
 
 
 class _Decorator(Protocol):
@@ -98,8 +100,8 @@ def _options(fastmath: bool = False) -> dict[str, Any]:
 def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _Decorator:
     """Return a decorator that compiles a function where numba is installed.
 
-    Compiled functions release the interpreter's lock. One that is neither `entry` nor `part` runs
-    as plain Python where Python calls it.
+    Compiled functions release the interpreter's lock. Only `entry` functions are compiled for
+    calls from Python.
 
     Parameters
     ----------
@@ -132,67 +134,135 @@ def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _
             # Without a wrapper for Python, which takes a tenth of the time to compile: there the
             # function stays plain.
             return compiled_form(function, fastmath=fastmath)(function)
-        compiled: _Function = _njit_kept(function, _options())
+        compiled = numba.njit(**_options())(function)
+        if folder := code_folder():
+            compiled._cache = _CodeFiles(folder, f'{function.__module__}.{function.__qualname__}')
         _entry_points.append(compiled)
-        return compiled
+        entry_point: _Function = compiled
+        return entry_point
 
     return decorate
 
 
-@functools.cache
-def announce_compiling() -> None:
-    """Log once, where code is about to run that is not kept on disk, that it is compiled."""
-    if _is_missing:
-        _LOGGER.info('compiling for this processor, which takes 20 to 60 s')
+class _CodeFiles:
+    """Files of the compiled forms of a function, in place of numba's own, which have no checksum.
 
+    A numba dispatcher calls `load_overload` before it compiles a form, and `save_overload` after
+    it.
+    """
 
-def _njit_kept(function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    """Compile `function` with its code kept on disk, if there is a folder to trust for it."""
-    import numba
+    kept: ClassVar[dict[str, str]] = {}  # a file of each function that is loaded or saved
 
-    folder = code_folder()
-    if folder is not None:
-        # numba reads this once, here. Without it, code would lie beside our sources.
-        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
+    def __init__(self, folder: Path, name: str) -> None:
+        self.cache_path, self._name = folder, name
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        """Return what `save_overload` was given; None if numba has to compile it."""
+        from numba.core.compiler import CompileResult
+
+        target.refresh()
+        path = self._path(signature, target.codegen())
+        if (code := _read_whole(path)) is None:
+            _begin_turn(self.cache_path)
+            if (code := _read_whole(path)) is None:
+                _announce_compiling()
+                return None
+            _end_turn()  # another process has compiled it meanwhile
+        self._note(path)
+        return CompileResult._rebuild(target, *pickle.loads(code))
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        """Write a form that is compiled; a full disk is a warning."""
+        from numba.core.serialize import dumps
+
+        path = self._path(signature, result.codegen)
         try:
-            kept = numba.njit(**options, cache=True)(function)
-        finally:
-            numba.config.CACHE_DIR = before
-        if folder in Path(kept.stats.cache_path).parents:
-            # numba has no public hook for a full disk; a numba without these names goes without.
-            cache = getattr(kept, '_cache', None)
-            for name in ('load_overload', 'save_overload'):
-                if hasattr(cache, name):
-                    setattr(cache, name, _or_nothing(getattr(cache, name)))
-            return kept
-        _log_not_kept(f'{folder} cannot be written to')
-    return numba.njit(**options)(function)
-
-
-def _or_nothing(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `method` of numba's cache, without the errors of a disk that is full or damaged."""
-
-    def attempt(*arguments: Any) -> Any:
-        try:
-            return method(*arguments)
+            if not result.library.has_dynamic_globals:  # addresses in this process
+                _write_whole(path, dumps(result._reduce()))
+                self._note(path)
         except OSError as error:
             _log_not_kept(str(error))
-            return None
+        finally:
+            _end_turn()
 
-    return attempt
+    def _path(self, signature: Any, codegen: Any) -> Path:
+        key = f'{signature} {codegen.magic_tuple()}'  # the second is the processor
+        digest = hashlib.sha256(key.encode()).hexdigest()[:16]
+        return self.cache_path / f'{self._name}-{digest}'
+
+    def _note(self, path: Path) -> None:
+        """List the files that a frame needs, once each function has one."""
+        self.kept[self._name] = path.name
+        if len(self.kept) == len(_entry_points) and not is_code_kept():
+            with contextlib.suppress(OSError):
+                _write_whole(self.cache_path / _ALL, '\n'.join(self.kept.values()).encode())
+
+
+def _read_whole(path: Path) -> bytes | None:
+    """Return what `_write_whole` was given; None if the file is missing or damaged."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    checksum, data = content[:_CHECKSUM_SIZE], content[_CHECKSUM_SIZE:]
+    return data if hashlib.sha256(data).digest() == checksum else None
+
+
+def _write_whole(path: Path, data: bytes) -> None:
+    """Write a file with its checksum, at once."""
+    unfinished = path.with_name(f'{path.name}.tmp{os.getpid()}')
+    try:
+        with unfinished.open('wb') as file:
+            file.write(hashlib.sha256(data).digest() + data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(unfinished, path)
+    except OSError:
+        unfinished.unlink(missing_ok=True)
+        raise
+
+
+def _begin_turn(folder: Path) -> None:
+    """Wait until no other process compiles, or the patience is at an end."""
+    global _turn, _patience
+    if _turn is not None:
+        return
+    with contextlib.suppress(OSError):  # the disk is full, or has no locks
+        _turn = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        while _patience > 0.0:
+            try:
+                return fcntl.flock(_turn, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                time.sleep(0.05)
+                _patience -= 0.05
+
+
+def _end_turn() -> None:
+    """Let another process compile."""
+    global _turn
+    if _turn is not None:
+        with contextlib.suppress(OSError):
+            fcntl.flock(_turn, fcntl.LOCK_UN)  # a forked process may have it open
+        os.close(_turn)
+        _turn = None
+
+
+@functools.cache
+def _announce_compiling() -> None:
+    """Log once that code is compiled."""
+    _LOGGER.info('compiling for this processor, which takes 20 to 60 s')
 
 
 def _log_not_kept(reason: str) -> None:
     """Log once that code is compiled at every start."""
     global _is_not_kept
-    if _is_not_kept:
-        return
-    _is_not_kept = True
-    _LOGGER.warning(
-        'compiled code is not kept on disk (%s): every start compiles, which takes 20 to 60 s; '
-        'set NUMBA_CACHE_DIR to a folder of your own',
-        reason,
-    )
+    if not _is_not_kept:
+        _is_not_kept = True
+        _LOGGER.warning(
+            'compiled code is not kept on disk (%s): every start compiles, which takes 20 to '
+            '60 s; set NUMBA_CACHE_DIR to a folder of your own',
+            reason,
+        )
 
 
 @functools.cache
@@ -211,11 +281,6 @@ def code_folder() -> Path | None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder = folder.resolve()
         _require_private(folder)
-        lock, is_alone = _lock(folder)
-        try:
-            _delete_damaged(folder, is_alone)
-        finally:
-            fcntl.flock(lock, fcntl.LOCK_SH)
     except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home
         _log_not_kept(str(error))
         return None
@@ -235,34 +300,6 @@ def _require_private(folder: Path) -> None:
             raise PermissionError(f'others can write to {path}')
 
 
-def _lock(folder: Path) -> tuple[int, bool]:
-    """Lock `folder` until the process ends, and say whether no other uses it.
-
-    The file has the place of our sources, by which `_delete_old` knows code of earlier ones.
-    """
-    lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        fcntl.flock(lock, fcntl.LOCK_SH)  # once the other has looked at the files
-        return lock, False
-    if os.fstat(lock).st_size == 0:
-        with contextlib.suppress(OSError):  # the disk is full
-            os.write(lock, os.fsencode(_CORE))
-    return lock, True
-
-
-def _delete_old(folder: Path) -> None:
-    """Delete code beside `folder` of other sources in our place, or in one that is gone."""
-    for path in folder.parent.glob(f'*/{_LOCK}'):
-        sources = os.fsdecode(path.read_bytes())
-        if path.parent == folder or not (sources == str(_CORE) or not Path(sources).exists()):
-            continue
-        with path.open('rb') as lock, contextlib.suppress(BlockingIOError):
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(path.parent, ignore_errors=True)
-
-
 def _digest() -> str:
     """Name of what the code was compiled from: sources, where they lie, and versions."""
     versions = [sys.version, np.__version__, *map(metadata.version, ('numba', 'llvmlite'))]
@@ -272,95 +309,21 @@ def _digest() -> str:
     return digest.hexdigest()[:16]
 
 
-def _checksums(folder: Path) -> dict[str, str]:
-    """SHA-256 of each file in which numba keeps code, by its path in `folder`."""
-    found = {}
-    for entry in folder.rglob('*.nb[ic]'):
-        with contextlib.suppress(FileNotFoundError):  # another process has just deleted it
-            name = entry.relative_to(folder).as_posix()
-            found[name] = hashlib.sha256(entry.read_bytes()).hexdigest()
-    return found
-
-
-def _read_kept(folder: Path) -> dict[str, Any]:
-    """Return what `keep_code` has noted."""
-    try:
-        kept = json.loads((folder / _KEPT).read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return kept if isinstance(kept, dict) else {}
-
-
-def _write_kept(folder: Path, kept: dict[str, Any]) -> None:
-    """Note what `_read_kept` returns."""
-    unfinished = folder / f'{_KEPT}.{os.getpid()}'
-    unfinished.write_text(json.dumps(kept))
-    os.replace(unfinished, folder / _KEPT)
-
-
-def _delete_damaged(folder: Path, is_alone: bool) -> None:
-    """Delete the files that do not fit their checksum; numba compiles again what they held.
-
-    Unless we are alone, one without a checksum may be of a process that compiles.
-    """
-    global _is_warm, _is_missing
-    kept, found = _read_kept(folder), _checksums(folder)
-    damaged = [
-        name
-        for name, checksum in found.items()
-        if kept.get(name) != checksum and (is_alone or name in kept)
-    ]
-    for name in damaged:
-        (folder / name).unlink(missing_ok=True)
-    if is_alone and kept.keys() & damaged:
-        # What takes their place has no checksum yet, rather than a wrong one.
-        left = {name: checksum for name, checksum in kept.items() if name not in damaged}
-        _write_kept(folder, {**left, 'warm': False})
-    is_whole = bool(kept) and not damaged and found.keys() >= kept.keys() - {'warm'}
-    _is_warm, _is_missing = is_whole and kept.get('warm') is True, not is_whole
-
-
-def keep_code() -> None:
-    """Note checksums of the code that numba has kept, so that the next start uses it."""
-    global _n_ready, _n_kept, _is_warm
-    n_ready = sum(len(entry.overloads) for entry in _entry_points)
-    folder = code_folder()
-    if folder is None or n_ready == _n_ready:
-        return
-    _n_ready = n_ready
-    # Of those the ones that were compiled, not loaded; slow to count.
-    n_compiled = sum(len(entry.stats.cache_misses) for entry in _entry_points)
-    warm = _is_whole() and not _is_not_kept
-    if n_compiled == _n_kept and (_is_warm or not warm):
-        return
-    _n_kept, _is_warm = n_compiled, _is_warm or warm
-    try:
-        found = _checksums(folder)
-        # Fewer files than functions: another process has deleted some as damaged.
-        _is_warm = _is_warm and sum(name.endswith('.nbc') for name in found) >= len(_entry_points)
-        _write_kept(folder, {**found, 'warm': _is_warm})
-        if _is_warm:
-            _delete_old(folder)
-    except OSError as error:
-        _log_not_kept(str(error))
-
-
-def has_to_compile() -> bool:
-    """Whether the first frame in compiled code would take long: none is kept, none is at hand."""
-    return JIT_ENABLED and not (_is_whole() or (code_folder() is not None and _is_warm))
-
-
 def count_ready() -> tuple[int, int]:
     """How many functions are compiled or loaded in this process, and how many there are."""
     return sum(bool(entry.overloads) for entry in _entry_points), len(_entry_points)
 
 
-def _is_whole() -> bool:
-    """Whether each function that is called from Python is compiled or loaded in this process."""
+def has_to_compile() -> bool:
+    """Whether the first frame in compiled code would take long: none is kept, none is at hand."""
     n_ready, n_functions = count_ready()
-    return 0 < n_functions == n_ready
+    return JIT_ENABLED and not (0 < n_functions == n_ready or is_code_kept())
 
 
 def is_code_kept() -> bool:
-    """Whether all code that a frame needs lies on disk."""
-    return _is_warm
+    """Whether all code that a frame needs lies on disk, whole."""
+    folder = code_folder()
+    names = _read_whole(folder / _ALL) if folder else None
+    if not (folder and names):
+        return False
+    return all(_read_whole(folder / name) is not None for name in names.decode().splitlines())

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar, overload
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -38,34 +40,17 @@ NO_GROUND = 'next to nothing of the scan is ground: is sensor.height right, and 
 _Value = TypeVar('_Value')
 
 
-class cached_property(Generic[_Value]):  # noqa: N801 - a decorator
-    """``functools.cached_property`` as it is from Python 3.12 on: without a lock.
+class cached_property(functools.cached_property[_Value]):  # noqa: N801 - a decorator
+    """``functools.cached_property``, without the lock that it has before Python 3.12.
 
-    The lock of older versions is one for all objects of the class: a process forked while a
-    thread computes the property of any of them would wait for it for ever. Two threads that ask
-    one object at once may both compute the value, which is the same.
+    That is one for all objects of the class: a process forked while a thread computes the property
+    of any of them would wait for it for ever. Two threads that ask one object at once may both
+    compute the value, which is the same.
     """
 
     def __init__(self, compute: Callable[[Any], _Value]) -> None:
-        self._compute = compute
-        self.__doc__ = compute.__doc__
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    @overload
-    def __get__(self, instance: None, owner: type) -> cached_property[_Value]: ...
-
-    @overload
-    def __get__(self, instance: object, owner: type) -> _Value: ...
-
-    def __get__(self, instance: object | None, owner: type) -> cached_property[_Value] | _Value:
-        if instance is None:
-            return self
-        # The next access finds the value in the object and does not come here.
-        with usual_errors():
-            value = instance.__dict__[self._name] = self._compute(instance)
-        return value
+        super().__init__(usual_errors()(compute))
+        self.lock = contextlib.nullcontext()
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from gp_ground_seg.core.backend import Backend, make_backend
 from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_errors
 from gp_ground_seg.core.gp.learning import Learned
-from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.parameters.schema import NO_BOX
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
@@ -134,7 +133,7 @@ class GroundSegmenter:
             does not show the ground well, its height, and its angles where they are auto.
         box_frame : tuple of float arrays, optional
             Rotation (3, 3) and translation (3,) [m] from the frame of this scan into that of
-            ``input.crop_box``; by default they are one.
+            ``input.crop_box``; by default the box is in the frame of this scan.
 
         Raises
         ------
@@ -392,7 +391,6 @@ def warm_up(config: Config | None = None) -> Backend:
     wall = xyz[25] + [0.0, 0.0, 1.0]
     points = np.concatenate([xyz.reshape(-1, 3), wall]).astype(np.float32)
     segmenter.segment(points)
-    keep_code()
     return segmenter.backend
 
 

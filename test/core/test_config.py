@@ -10,7 +10,6 @@ from array import array
 
 import numpy as np
 import pytest
-from cli_runner import error_line, run
 from config_samples import accepted_values, configs
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,7 +18,6 @@ from gp_ground_seg import Config, ConfigError, GroundSegError
 from gp_ground_seg.cli.options import parse_setting
 from gp_ground_seg.core.parameters import number_tuples
 from gp_ground_seg.core.parameters.config import find_spec, parameter_specs
-from gp_ground_seg.core.parameters.removed import REMOVED
 
 SPECS = parameter_specs()
 NUMBERS = [spec for spec in SPECS if spec.type in (int, float)]
@@ -124,12 +122,6 @@ def test_a_box_is_six_numbers_or_none():
             spec.check(value)
 
 
-def test_a_box_may_be_written_by_launch_ros(from_text):
-    lines = ''.join(f'        - {bound}\n' for bound in BOX)
-    text = f'/**:\n  ros__parameters:\n      input.crop_box: !!python/tuple\n{lines}'
-    assert from_text(text).input.crop_box == BOX
-
-
 def test_groups_given_whole_are_checked_and_converted():
     groups = {field.name: field.default for field in dataclasses.fields(Config)}
     label = dataclasses.replace(groups['label'], ground_tolerance=1)
@@ -182,56 +174,30 @@ def test_unknown_names_come_with_the_nearest(name, hint):
         Config().replace(label=0.2)
 
 
-@pytest.mark.parametrize('key', [key for key in REMOVED if re.match(r'\w+\.\w+(=|$)', key)])
-def test_what_is_removed_comes_with_what_to_use_instead(key, tmp_path, capsys):
-    name, _, value = key.partition('=')
-    group, field = name.split('.')
-    path = tmp_path / 'old.yaml'
-    path.write_text(f'/**: {{ros__parameters: {{{group}: {{{field}: {value or 1}}}}}}}\n')
-    line = f'{key} was removed: {REMOVED[key]}'
-    for read in (lambda: Config().replace(**{name: value or 1}), lambda: Config.from_yaml(path)):
-        with pytest.raises(ConfigError, match=re.escape(line) + '$'):
-            read()
-    assert Config.problems_of_file(path) == [line]
-    for words in (['--set', f'{name}={value or 1}'], ['--config', path]):
-        assert run('config', 'dump', *words) == 2
-        assert error_line(capsys).endswith(line)
-    if value:
-        assert value not in find_spec(name).choices
-        with pytest.raises(ConfigError, match=re.escape(line)):
-            Config(**{group: dataclasses.replace(getattr(Config(), group), **{field: value})})
-    else:
-        assert name not in Config().flat()
-
-
 @pytest.mark.parametrize(
-    ('changes', 'words'),
+    ('changes', 'said'),
     [
-        ({'grid.r_max': 500.0, 'faces.cell_size': 0.05}, ['faces.cell_size', '3.6 GB', '2 GB']),
-        ({'grid.r_min': np.nextafter(50.0, 0.0), 'grid.r_max': 50.0}, ['first bin', '0.001 m']),
-        ({'grid.n_bins': 1024, 'grid.bin_growth': 3.0}, ['grid.bin_growth = 3', '1.1e-07 m']),
+        ({'grid.r_max': 500.0, 'faces.cell_size': 0.05}, r'faces\.cell_size .* 3\.6 GB.* 2 GB'),
+        (
+            {'grid.r_min': np.nextafter(50.0, 0.0), 'grid.r_max': 50.0},
+            r'first bin .* at least 0\.001 m',
+        ),
+        ({'grid.n_bins': 1024, 'grid.bin_growth': 3.0}, r'grid\.bin_growth = 3 .* 1\.1e-07 m'),
+        *(
+            ({lower: wrong, upper: low}, f'^{lower} = {wrong:g}: must be below {upper} = {low:g}$')
+            for lower, upper, low, high in (
+                ('grid.r_min', 'grid.r_max', 20.0, 30.0),
+                ('length_scale.min', 'length_scale.max', 20.0, 60.0),
+                ('label.obstacle_min_height', 'label.obstacle_max_height', 3.0, 4.0),
+                ('output.min_height', 'output.max_height', 1.0, 2.0),
+            )
+            for wrong in (low, high)
+        ),
     ],
 )
-def test_what_cannot_run_is_refused(changes, words):
-    with pytest.raises(ConfigError) as refusal:
+def test_values_that_contradict_each_other_are_refused(changes, said):
+    with pytest.raises(ConfigError, match=said):
         Config().replace(**changes)
-    assert all(word in str(refusal.value) for word in words)
-
-
-@pytest.mark.parametrize(
-    ('lower', 'upper', 'low', 'high'),
-    [
-        ('grid.r_min', 'grid.r_max', 20.0, 30.0),
-        ('length_scale.min', 'length_scale.max', 20.0, 60.0),
-        ('label.obstacle_min_height', 'label.obstacle_max_height', 3.0, 4.0),
-    ],
-)
-def test_rules_between_values(lower, upper, low, high):
-    assert Config().replace(**{lower: low, upper: high})[lower] == low
-    for wrong in (low, high):
-        message = re.escape(f'{lower} = {wrong:g}: must be below {upper} = {low:g}')
-        with pytest.raises(ConfigError, match=message):
-            Config().replace(**{lower: wrong, upper: low})
 
 
 @settings(max_examples=15)
@@ -252,30 +218,29 @@ def test_forms_agree_and_no_change_but_in_a_copy(config, other):
     assert hash(config) == hash(config.replace())
 
 
+IN_ROS = '/**:\n  ros__parameters:'
 GIVEN = 'label: {ground_tolerance: 0.15}, sensor: {height: 2.0}'
+CHANGED = {'label.ground_tolerance': 0.15, 'sensor.height': 2.0}
 QOS = 'qos_overrides: {/points: {subscription: {depth: 3}}}'
+LAUNCH_ROS = ''.join(f'        - {bound}\n' for bound in BOX)
 
 
 @pytest.mark.parametrize(
-    'text',
+    ('text', 'changes'),
     [
-        'label: {ground_tolerance: 0.15}\nsensor:\n  height: 2\n',
-        'label.ground_tolerance: 0.15\nsensor.height: 2\n',
-        f'/**:\n  ros__parameters: {{{GIVEN}}}\n',
-        '/**:\n  ros__parameters:\n    label.ground_tolerance: 0.15\n    sensor.height: 2\n',
-        f'ground_segmentation_node: {{ros__parameters: {{{GIVEN}}}}}\n',
-        f'/robot/ground_segmentation_node:\n  ros__parameters: {{{GIVEN}}}\n',
-        f'/**:\n  ros__parameters: {{use_sim_time: true, {QOS}, {GIVEN}}}\n',
+        ('label: {ground_tolerance: 0.15}\nsensor:\n  height: 2\n', CHANGED),
+        ('label.ground_tolerance: 0.15\nsensor.height: 2\n', CHANGED),
+        (f'{IN_ROS} {{{GIVEN}}}\n', CHANGED),
+        (f'{IN_ROS}\n    label.ground_tolerance: 0.15\n    sensor.height: 2\n', CHANGED),
+        (f'ground_segmentation_node: {{ros__parameters: {{{GIVEN}}}}}\n', CHANGED),
+        (f'/robot/ground_segmentation_node:\n  ros__parameters: {{{GIVEN}}}\n', CHANGED),
+        (f'{IN_ROS} {{use_sim_time: true, {QOS}, {GIVEN}}}\n', CHANGED),
+        (f'{IN_ROS}\n    input.crop_box: !!python/tuple\n{LAUNCH_ROS}', {'input.crop_box': BOX}),
+        *((empty, {}) for empty in ('', '# nothing\n', '{}', f'{IN_ROS} {{}}\n')),
     ],
 )
-def test_forms_of_files(from_text, text):
-    expected = Config().replace(**{'label.ground_tolerance': 0.15, 'sensor.height': 2.0})
-    assert from_text(text) == expected
-
-
-@pytest.mark.parametrize('text', ['', '# nothing\n', '{}', '/**:\n  ros__parameters: {}\n'])
-def test_files_without_parameters_are_the_defaults(from_text, text):
-    assert from_text(text) == Config()
+def test_forms_of_files(from_text, text, changes):
+    assert from_text(text) == Config().replace(**changes)
 
 
 @pytest.mark.parametrize('number', ['1e-1', '1E-1', '.1', '.1e0', '1.0e-1', '10e-2', '+0.1'])
@@ -289,21 +254,15 @@ def test_numbers_are_read_as_ros_reads_them(from_text, number):
         ('label: {ground_tolerence: 1.0}', 'did you mean label.ground_tolerance?'),
         ('label: {ground_tolerance: "0.1"}', "label.ground_tolerance = '0.1': must be a number"),
         ('label: {ground_tolerance: 99.0}', 'must be a number in [0.001, 5] m'),
-        ('label: {ground_tolerance: .nan}', 'must be a number in'),
-        ('label: {ground_tolerance: [0.1]}', 'must be a number in'),
         ('grid: {n_segments: 90.0}', 'must be an integer in [4, 2048]'),
-        ('grid: {n_segments: yes}', 'must be an integer in [4, 2048]'),
         ('grid: {n_bins: ' + '1' * 100_000 + '}', 'line 1: a number of 100000 digits'),
         ('grid: {n_bins: 0x' + 'f' * 200_000 + '}', 'line 1: a number of 200002 digits'),
         ('grid: {n_bins: !!int x}', 'not valid YAML: invalid literal'),
-        ('grid: {n_bins: !!bool x}', 'not valid YAML'),
-        ('grid: {n_bins: !!timestamp x}', 'not valid YAML'),
         ('grid: {n_bins: 2011-02-03}', 'grid.n_bins = datetime.date(2011, 2, 3): must be an int'),
         ('grid: ' + '[' * 3000, 'line 1: more than 20 levels'),
         ('\n'.join(f'a{k}: 1' for k in range(2000)), 'more than 500 values'),
         ('/**: {ros__parameters: {}, a: 1}', 'values beside ros__parameters, which ROS refuses'),
         ('grid: &a {n_bins: 9}\nlabel: *a', 'line 2: aliases (*name) are not accepted'),
-        ('grid: {r_min: 20.0, r_max: 10.0}', 'grid.r_min = 20: must be below grid.r_max = 10'),
         ('label:\n  # ground_tolerance: 0.1\n', "'label' is a group of parameters"),
         ('label: {ground_tolerance: {deep: 1.0}}', 'unknown parameter'),
         ('1: 2', "unknown parameter '1'"),
@@ -311,14 +270,10 @@ def test_numbers_are_read_as_ros_reads_them(from_text, number):
         ('label: {ground_tolerance: 0.1}\nlabel: {ground_tolerance: 0.1}', 'label: given twice'),
         ('label: {ground_tolerance: 0.1}\nlabel.ground_tolerance: 0.1', 'given twice'),
         ('- label', 'must be a mapping'),
-        ('just words', 'must be a mapping'),
         ('a: [', 'not valid YAML'),
         ('label: {ground_tolerance: 2011-99-99}', 'not valid YAML'),
-        ('label: &a {ground_tolerance: *a}', 'line 1: aliases'),
         ('/**: {label: {ground_tolerance: 0.1}}', 'ros__parameters'),
-        ('/**:\n  ros__parameters: 3\n', 'ros__parameters'),
         ('/a: {ros__parameters: {}}\n/b: {ros__parameters: {}}\n', 'parameters of 2 nodes'),
-        ('a: {ros__parameters: {}}\nlabel: {ground_tolerance: 0.1}', 'parameters of 2 nodes'),
         ('/**: {ros__parameters: {use_sim_tme: true}}', 'unknown parameter'),
     ],
 )

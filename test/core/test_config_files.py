@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from gp_ground_seg import Config, ConfigError
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import PRESETS, find_preset, parameter_specs
-from gp_ground_seg.core.parameters.removed import REMOVED
 
 GENERATE = 'run: make generate'
 generate = load_script('docs/generate.py')
@@ -86,19 +85,14 @@ def test_the_table_has_a_row_for_each_parameter_that_people_set():
         assert cells[3] == spec.description + f' (`{spec.symbol}`)' * bool(spec.symbol)
 
 
-def test_the_page_of_parameters_has_its_table_all_parameters_and_what_is_gone():
+def test_the_page_of_parameters_has_its_table_and_all_parameters():
     files = generate.generated_files(''.join(generate.marks_of(generate.SCORES)))
     source = [files['docs/parameters.md']]
     load_script('docs/conf.py').insert_code(None, 'parameters', source)
-    page, _, removed = source[0].partition('\n## Removed\n')
-    table, _, listing = page.partition(generate.ALL_PARAMETERS)
+    table, _, listing = source[0].partition(generate.ALL_PARAMETERS)
     assert table.endswith(generate.to_markdown_table()) and listing == ''
-    (path,) = re.findall('^```{literalinclude} (.*)$', page, re.MULTILINE)
+    (path,) = re.findall('^```{literalinclude} (.*)$', source[0], re.MULTILINE)
     assert (REPOSITORY / 'docs' / path).samefile(REPOSITORY / 'config' / 'default.yaml')
-    _, _, *rows = (line for line in removed.splitlines() if line.startswith('|'))
-    shown = (line[2:-2].split(' | ') for line in rows)
-    found = [(name, use) for names, use in shown for name in names.split(', ')]
-    assert sorted(found) == sorted((f'`{name}`', use) for name, use in REMOVED.items())
 
 
 @pytest.mark.parametrize('marks', ['', 'b', 'e', 'eb', 'bbe', 'bee'])
@@ -152,7 +146,7 @@ def test_the_paper_preset_has_none_of_our_departures():
     assert growth.max_standardised_depth == growth.max_standardised_residual
 
 
-def test_check_says_everything_at_once(tmp_path, capsys):
+def test_check_says_everything_that_is_wrong_at_once(tmp_path, capsys):
     path = tmp_path / 'my.yaml'
     path.write_text(
         '/**:\n  ros__parameters:\n    use_sim_time: true\n'
@@ -161,41 +155,52 @@ def test_check_says_everything_at_once(tmp_path, capsys):
         '    sensor: {height: 2}\n'
         '    grid: {n_segments: many}\n'
     )
-    good = tmp_path / 'good.yaml'
-    good.write_text('label: {ground_tolerance: 0.15}\nsensor: {height: 2}\n')
-    assert run('config', 'check', path, good) == 2
-    out, err = capsys.readouterr()
-    lines = err.splitlines()
-    assert len(lines) == 3
-    assert all(line.startswith(f'{path}: ') for line in lines)
-    assert 'did you mean label.ground_tolerance?' in lines[0]
-    assert 'label.ground_tolerance = 9.0: must be a number in [0.001, 5] m' in lines[1]
-    assert "grid.n_segments = 'many'" in lines[2]
-    n = len(parameter_specs())
-    assert out.startswith(f'{good}: good for --config, but not for the node, which needs the form')
-    assert out.endswith(f'; 2 of {n} parameters given, 2 differ from the defaults\n')
-    good.write_text('sensor: {height: 2}\n')
-    assert run('config', 'check', good) == 0
-    assert capsys.readouterr().out.endswith(', 1 differs from the defaults\n')
+    assert run('config', 'check', path) == 2
+    lines = capsys.readouterr().err.splitlines()
+    said = [
+        'did you mean label.ground_tolerance?',
+        'label.ground_tolerance = 9.0: must be a number in [0.001, 5] m',
+        "grid.n_segments = 'many'",
+    ]
+    for line, part in zip(lines, said, strict=True):
+        assert line.startswith(f'{path}: ') and part in line
     for text, problem in (
         ('grid: {r_min: 20.0, r_max: 10.0}', 'grid.r_min = 20: must be below grid.r_max = 10'),
         ('grid: [', 'not valid YAML'),
-        ('a: 1\na: 2', 'given twice'),
+        (None, 'No such file'),
     ):
-        good.write_text(text)
-        (found,) = Config.problems_of_file(good)
+        path.write_text(text) if text else path.unlink()
+        (found,) = Config.problems_of_file(path)
         assert problem in found
-    (found,) = Config.problems_of_file(tmp_path / 'missing.yaml')
-    assert 'No such file' in found
 
 
-@pytest.mark.parametrize('words', [('check',), ('dump', '--config')])
-def test_a_file_without_parameters_gets_a_note(tmp_path, capsys, words):
-    path = tmp_path / 'my.yaml'
-    path.write_text('# nothing\n')
-    assert run('config', *words, path) == 0
+FOR_COMMANDS = 'good for --config, but not for the node, which needs the form of ROS: '
+
+
+@pytest.mark.parametrize(
+    ('text', 'use', 'given'),
+    [
+        ('label: {ground_tolerance: 0.15}\nsensor: {height: 2}', FOR_COMMANDS, '2, 2 differ'),
+        ('/**: {ros__parameters: {grid: {n_bins: 90}}}', 'good; ', '1, 1 differs'),
+        ('ground_segmentation_node: {ros__parameters: {}}', 'good; ', '0, 0 differ'),
+        ('/other: {ros__parameters: {}}', 'good for a node named /other only; ', '0, 0 differ'),
+        ('# nothing', FOR_COMMANDS, '0, 0 differ'),
+    ],
+)
+def test_check_says_who_reads_a_file_and_how_much_it_gives(text, use, given, tmp_path, capsys):
+    path = tmp_path / 'robot.yaml'
+    path.write_text(text)
+    assert run('config', 'check', path) == 0
+    out, err = capsys.readouterr()
+    n_given, differ = given.split(', ')
+    assert out.startswith(f'{path}: {use}')
+    assert f'; {n_given} of {len(parameter_specs())} parameters given, {differ} from' in out
     note = f'gp-ground-seg: note: {path}: no parameters of the segmentation in it\n'
-    assert capsys.readouterr().err == note
+    assert err == note * (n_given == '0')
+    is_taken = run('config', 'dump', '--config', path) == 0
+    err = capsys.readouterr().err
+    assert is_taken == ('other' not in use)
+    assert err == note * (n_given == '0') if is_taken else 'parameters of node /other; must' in err
 
 
 def test_file_goes_over_preset_and_setting_over_file(tmp_path, capsys):

@@ -4,6 +4,7 @@ import fcntl
 import hashlib
 import json
 import os
+import signal
 import stat
 import subprocess
 import sys
@@ -19,9 +20,7 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.core import jit as jit_module
 
 MODULE = """
-from gp_ground_seg.core.jit import (
-    JIT_ENABLED, announce_compiling, code_folder, is_code_kept, jit, keep_code,
-)
+from gp_ground_seg.core.jit import code_folder, has_to_compile, is_code_kept, jit
 
 @jit(entry=True)
 def double(x):
@@ -32,28 +31,28 @@ def half(x):
     return 0.5 * x
 """
 RUN = """
-import json, logging, os, pathlib, sys, time
+import json, logging, os, signal, sys
 logging.basicConfig(level=logging.INFO, stream=sys.stderr, format='%(message)s')
 import small
-if 'IDLE' not in os.environ:
-    small.announce_compiling()
-result = None if 'IDLE' in os.environ else small.double(21.0)
-hits, misses = (sum(c.values()) for c in small.double.stats[1:]) if small.JIT_ENABLED else (0, 0)
+from gp_ground_seg.core import jit
+jit._patience = float(os.environ.get('PATIENCE', '60'))
 was_kept = small.is_code_kept()
-if 'WAIT' in os.environ:
-    pathlib.Path('compiled').touch()
-    while not pathlib.Path('go').exists():
-        time.sleep(0.01)
-if 'COLD' not in os.environ:
+assert small.has_to_compile() == (jit.JIT_ENABLED and not was_kept)
+result, used = small.double(21.0), [small.double]
+if 'KILL' in os.environ:
+    os.kill(os.getpid(), signal.SIGKILL)
+if 'PART' not in os.environ:
     small.half(1.0)
-small.keep_code()
+    used.append(small.half)
+stats = [one.stats for one in used if jit.JIT_ENABLED]
+hits, misses = (sum(sum(one[k].values()) for one in stats) for k in (1, 2))
 folder = small.code_folder()
 print(json.dumps([result, hits, misses, was_kept, str(folder) if folder else None]))
 """
 
 
 class Program:
-    """A module with one compiled function, run in a process of its own."""
+    """A module with two compiled functions, run in a process of its own."""
 
     def __init__(self, folder: Path):
         self.folder, self.cache = folder, folder / 'cache'
@@ -77,18 +76,13 @@ class Program:
             cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
 
-    @property
-    def entries(self) -> list[Path]:
-        return sorted(self.cache.rglob('*.nb[ic]'))
-
-    @property
-    def notes(self) -> Path:
-        (found,) = self.cache.rglob('kept.json')
+    def code(self, name: str = 'double') -> Path:
+        (found,) = self.cache.rglob(f'small.{name}-*')
         return found
 
 
-COMPILED, LOADED = [42.0, 0, 1, False], [42.0, 1, 0, True]
-NOT_KEPT = [42.0, 0, 1, False, None]
+COMPILED, LOADED = [42.0, 0, 2, False], [42.0, 2, 0, True]
+NOT_KEPT = [42.0, 0, 2, False, None]
 
 
 @pytest.fixture
@@ -98,19 +92,25 @@ def program(tmp_path):
 
 
 def test_code_is_compiled_once_said_once_and_then_loaded(program):
-    program.run(IDLE='1', COLD='1')
-    assert program.stderr == ''
-    assert program.run(COLD='1')[:4] == COMPILED
-    assert 'compiling' in program.stderr
-    # A command may need a part of the code: that is not all, but nothing of it is missing.
-    assert program.run(COLD='1')[:4] == [42.0, 1, 0, False] and program.stderr == ''
-    assert program.run()[:3] == LOADED[:3]
+    assert program.run(PART='1')[:4] == [42.0, 0, 1, False]
+    assert program.stderr.count('compiling') == 1
+    # A command may need a part of the code: nothing of it is missing.
+    assert program.run(PART='1')[:4] == [42.0, 1, 0, False] and program.stderr == ''
+    assert program.run()[:4] == [42.0, 1, 1, False] and program.stderr.count('compiling') == 1
     *loaded, folder = program.run()
     assert loaded == LOADED and program.stderr == ''
     # Beside the sources it would survive pip's uninstall, as a package without a version.
-    assert all(Path(folder) in entry.parents for entry in program.entries)
+    assert program.code().parent == Path(folder)
     assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
     assert not list(program.folder.glob('__pycache__/*.nb[ic]'))
+
+
+def test_what_is_compiled_is_kept_although_the_process_is_killed(program):
+    """As a warm-up that is killed half way: the next one does not begin again."""
+    with program.start(KILL='1') as process:
+        assert process.wait(timeout=120) == -signal.SIGKILL
+    assert program.run()[:4] == [42.0, 1, 1, False]
+    assert program.run()[:4] == LOADED
 
 
 def test_code_lies_in_the_cache_of_the_user_by_default_and_never_in_the_current_folder(program):
@@ -125,17 +125,11 @@ def test_code_lies_in_the_cache_of_the_user_by_default_and_never_in_the_current_
     assert {p.name for p in program.folder.iterdir()} - {'__pycache__'} == {'home', 'small.py'}
 
 
-def code(program):
-    return next(entry for entry in program.entries if entry.suffix == '.nbc')
-
-
-def index(program):
-    return next(entry for entry in program.entries if entry.suffix == '.nbi')
-
-
-def pickle(program):
-    """An index that is a pickle of a stranger's call."""
-    return b"cos\nsystem\n(S'touch " + str(program.folder / 'ran').encode() + b"'\ntR."
+def plant(path, with_checksum=False):
+    """Put a pickle of a stranger's call in place of code."""
+    content = b"cos\nsystem\n(S'touch ran'\ntR."
+    checksum = hashlib.sha256(content).digest() if with_checksum else bytes(32)
+    path.write_bytes(checksum + content)
 
 
 def zeros(path):
@@ -144,34 +138,35 @@ def zeros(path):
 
 
 DAMAGES = {
-    'zeros in the code': lambda p: zeros(code(p)),
-    'code cut off': lambda p: code(p).write_bytes(code(p).read_bytes()[:100]),
-    'index cut off': lambda p: index(p).write_bytes(index(p).read_bytes()[:100]),
-    'no code': lambda p: code(p).unlink(),
-    'planted index': lambda p: index(p).write_bytes(pickle(p)),
-    'no notes': lambda p: p.notes.unlink(),
-    'empty notes': lambda p: p.notes.write_bytes(b''),
+    'planted': plant,
+    'zeros': zeros,
+    'cut off': lambda path: path.write_bytes(path.read_bytes()[:100]),
+    'empty': lambda path: path.write_bytes(b''),
+    'missing': lambda path: path.unlink(),
 }
 
 
-OFTEN = ('planted index',)
+OFTEN = 'planted'
 
 
 @pytest.mark.parametrize(
-    'names', [OFTEN, pytest.param(DAMAGES.keys() - {*OFTEN}, marks=pytest.mark.slow)]
+    'names', [[OFTEN], pytest.param(DAMAGES.keys() - {OFTEN}, marks=pytest.mark.slow)]
 )
-def test_damaged_code_is_compiled_again(program, names):
+def test_damaged_code_is_compiled_again_and_that_of_other_functions_loaded(program, names):
     program.run()
     for name in names:
-        DAMAGES[name](program)
-        assert program.run()[:4] == COMPILED, name
+        DAMAGES[name](program.code())
+        assert program.run()[:4] == [42.0, 1, 1, False], name
+        assert program.run()[:4] == LOADED, name
+    # Without the list of files nobody knows that they are all there, until they are loaded.
+    DAMAGES[next(iter(names))](next(program.cache.rglob('all')))
+    assert program.run()[:4] == [*LOADED[:3], False]
     assert program.run()[:4] == LOADED
     assert not (program.folder / 'ran').exists()
 
 
 @pytest.mark.parametrize('limit', [pytest.param(0, marks=pytest.mark.slow), 1024])
 def test_a_full_disk_ends_nothing(program, limit):
-    """With the larger one numba writes its index, and no code."""
     *result, _ = program.run(limit, PYTHONDONTWRITEBYTECODE='1')
     assert result == COMPILED
     (line,) = [line for line in program.stderr.splitlines() if 'not kept on disk' in line]
@@ -182,47 +177,18 @@ def test_a_full_disk_ends_nothing(program, limit):
     assert program.run(limit)[:4] == LOADED and program.stderr == ''
 
 
-def test_a_process_that_starts_leaves_what_another_compiles(program):
-    with program.start(WAIT='1') as first:
-        while not (program.folder / 'compiled').exists():
-            assert first.poll() is None
-        before = {path: path.stat().st_ino for path in program.entries}
-        is_noted = bool(list(program.cache.rglob('kept.json')))
-        second = program.run(COLD='1')
-        after = {path: path.stat().st_ino for path in program.entries}
-        (program.folder / 'go').touch()
-        first.communicate(timeout=120)
-    assert before and not is_noted
-    assert second[:3] == LOADED[:3] and after == before
+def test_one_process_compiles_and_others_wait_for_its_files(program):
+    processes = [program.start() for _ in range(3)]
+    found = [json.loads(process.communicate(timeout=120)[0]) for process in processes]
+    assert {result for result, *_ in found} == {42.0}
+    assert sum(misses for _, _, misses, *_ in found) == 2
+    assert sum(hits for _, hits, *_ in found) == 4
+    # One that is suspended, or hangs, is not waited for without end.
+    program.code().unlink()
+    with next(program.cache.rglob('lock')).open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert program.run(PATIENCE='0.2')[:4] == [42.0, 1, 1, False]
     assert program.run()[:4] == LOADED
-
-
-def test_what_several_find_damaged_is_kept_again(program):
-    program.run()
-    DAMAGES['planted index'](program)
-    for process in [program.start() for _ in range(3)]:
-        said, errors = process.communicate(timeout=120)
-        assert json.loads(said)[0] == 42.0 and 'not kept' not in errors
-    assert program.run()[:4] == LOADED
-
-
-def test_code_of_earlier_sources_goes_when_later_is_kept(program):
-    ours = program.cache / 'gp_ground_seg'
-    ours.mkdir(parents=True, mode=0o700)
-    sources = {
-        'earlier': jit_module._CORE, 'used': jit_module._CORE, 'gone': '/no/such/sources',
-        'other': program.folder, 'unknown': '',
-    }  # fmt: skip
-    for name, place in sources.items():
-        (ours / name).mkdir()
-        (ours / name / 'lock').write_text(str(place))
-    with (ours / 'used' / 'lock').open() as lock:
-        fcntl.flock(lock, fcntl.LOCK_SH)
-        program.run(COLD='1')
-        assert len(list(ours.iterdir())) == 6
-        *_, folder = program.run()
-    left = {path.name for path in ours.iterdir()}
-    assert left == {'used', 'other', 'unknown', Path(folder).name}
 
 
 @pytest.mark.parametrize(
@@ -234,12 +200,7 @@ def test_code_of_earlier_sources_goes_when_later_is_kept(program):
 )
 def test_code_is_not_read_from_where_others_can_put_it(program, where, mode, reason):
     *_, folder = program.run()
-    DAMAGES['planted index'](program)
-    # As if it had been noted, too.
-    notes = json.loads(program.notes.read_text())
-    planted = hashlib.sha256(pickle(program)).hexdigest()
-    notes[index(program).relative_to(folder).as_posix()] = planted
-    program.notes.write_text(json.dumps(notes))
+    plant(program.code(), with_checksum=True)
     Path(folder, where).chmod(mode)
     assert program.run() == NOT_KEPT
     assert reason in program.stderr

@@ -10,17 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_samples import write_ros2_bag
 from conftest import fewer
 
-from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
+from gp_ground_seg import Config, GroundSegmenter, Label, PointCloudError
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.core.parameters.config import size_of_tables
-from gp_ground_seg.data.bags import BagReader
-from gp_ground_seg.data.files import staged_bag_folder
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -142,52 +139,6 @@ def test_an_interrupt_is_130_whatever_compiled_code_makes_of_it(run, monkeypatch
     assert cli.main([]) == 130
     assert capsys.readouterr().err == 'gp-ground-seg: interrupted\n'
     assert signal.getsignal(signal.SIGINT) is before
-
-
-@pytest.mark.parametrize(
-    ('text', 'words', 'is_taken'),
-    [
-        ('label: {ground_tolerance: 0.2}', 'good for --config, but not for the node', True),
-        ('/**: {ros__parameters: {grid: {n_bins: 90}}}', 'good; 1 of ', True),
-        ('ground_segmentation_node: {ros__parameters: {}}', 'good; 0 of ', True),
-        ('/other: {ros__parameters: {}}', 'good for a node named /other only; 0 of', False),
-    ],
-)
-def test_config_check_says_who_reads_a_file(text, words, is_taken, tmp_path, capsys):
-    path = tmp_path / 'robot.yaml'
-    path.write_text(text)
-    assert cli.main(['config', 'check', str(path)]) == 0
-    assert f'{path}: {words}' in capsys.readouterr().out
-    if is_taken:
-        Config.from_yaml(path)
-    else:
-        with pytest.raises(ConfigError, match='parameters of node /other; must be of'):
-            Config.from_yaml(path)
-
-
-@pytest.mark.parametrize('interrupted', [0, 1])
-@pytest.mark.parametrize('when', ['before', 'after'])
-def test_an_interrupted_replacement_leaves_a_whole_bag(interrupted, when, tmp_path, monkeypatch):
-    old = write_ros2_bag(tmp_path / 'drive', n_clouds=1)
-    rename, calls = os.rename, []
-
-    def interrupt(source, target):
-        calls.extend({source, target} & {tmp_path / 'drive'})  # not those of the writer
-        if len(calls) - 1 != interrupted:
-            return rename(source, target)
-        if when == 'after':
-            rename(source, target)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, 'rename', interrupt)
-    with (
-        pytest.raises(KeyboardInterrupt),
-        staged_bag_folder(tmp_path / 'drive', force=True) as part,
-    ):
-        new = write_ros2_bag(part, n_clouds=2)
-    with BagReader(tmp_path / 'drive') as bag:
-        assert list(bag.messages()) == (new if (interrupted, when) == (1, 'after') else old)
-    assert [path.name for path in tmp_path.iterdir()] == ['drive']
 
 
 @pytest.mark.parametrize('backend', ['numba', 'numpy'])

@@ -308,7 +308,6 @@ def double_in(folder, *fault):
         from double import double
 
         result = double(21.0)
-        jit.keep_code()
     return result, sum(double.stats.cache_hits.values()), disk.calls
 
 
@@ -318,7 +317,8 @@ def test_each_call_that_keeps_compiled_code_fails_in_turn(tmp_path):
     if not jit.HAVE_NUMBA:
         pytest.skip('nothing is compiled')
     (tmp_path / 'double.py').write_text(DOUBLE)
-    paths = [str(REPOSITORY), str(REPOSITORY / 'test'), str(tmp_path)]
+    tests = REPOSITORY / 'test'
+    paths = map(str, [REPOSITORY, tests, tests / 'data', tmp_path])
     changed = {'PYTHONPATH': os.pathsep.join(paths), 'NUMBA_DISABLE_JIT': '0'}
     command, pipes = [sys.executable, '-c', COMPILE], {'stdin': subprocess.PIPE}
     pipes |= {'stdout': subprocess.PIPE, 'stderr': subprocess.DEVNULL}

@@ -33,7 +33,6 @@ from gp_ground_seg.core.frame import (
 from gp_ground_seg.core.gp.evidence import ODDS, uses_neighbours_in
 from gp_ground_seg.core.gp.latent import given_log_length_scales
 from gp_ground_seg.core.gp.learning import Learned, given_theta, theta_space
-from gp_ground_seg.core.jit import announce_compiling, keep_code
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.number_tuples import numbers_of
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
@@ -51,7 +50,6 @@ class NumbaBackend:
 
     def build_grid(self, xyz: PointArray, config: Config) -> Scan:
         """Sort points into cells and tiles; lowest point of each cell."""
-        announce_compiling()
         xyz, n_points, dtype = in_columns(xyz), len(xyz), xyz.dtype
         geometry = grid_geometry(config.grid, config.faces.cell_size, dtype)
         n_segments, n_bins = config.grid.n_segments, config.grid.n_bins
@@ -181,5 +179,4 @@ class NumbaBackend:
             config.label.rule == 'roughness',
             result,
         )
-        keep_code()
         return result

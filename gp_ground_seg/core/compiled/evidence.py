@@ -31,7 +31,7 @@ def estimate_surface(
     observation: ObservationConfig,
     growth: GrowthConfig,
     is_latent: bool,
-    looks_aside: bool,
+    uses_neighbours: bool,
     by_roughness: bool,
     by_itself: SegmentSurfaces,
     mean: FloatArray,
@@ -40,7 +40,7 @@ def estimate_surface(
     """Do what `gp_ground_seg.core.gp.ground.estimate_surface` does, into the last three.
 
     `is_latent` and `by_roughness` are the model of the length-scale and the rule of the labels by
-    the parameters, `looks_aside` is `uses_neighbours_in`.
+    the parameters, `uses_neighbours` is `uses_neighbours_in`.
     """
     slope_std, knots, (n_segments, n_knots) = observation.slope_std, frame.knots, mean.shape
     own, nothing = np.empty((2, n_segments, n_knots)), np.empty((2, 0, 0))
@@ -48,17 +48,17 @@ def estimate_surface(
     if is_latent:
         u, knot_u = by_itself.log_length_scale, by_itself.knot_log_length_scale
         latent_log_length_scales(frame, theta, 1, u, knot_u)
-    max_slope = CLEARLY * slope_std if looks_aside else -1.0
+    max_slope = CLEARLY * slope_std if uses_neighbours else -1.0
     odds = _find_seeds(frame, theta, growth, max_slope, own[0], by_itself.seed)
     odds = odds if by_roughness else 0.0
     from_neighbours = nothing
-    if looks_aside:
+    if uses_neighbours:
         by_itself.mean[:], by_itself.std[:] = math.nan, math.nan
         grow_surfaces(frame, theta, observation, growth, odds, nothing, STEP, by_itself)
         _find_evidence(by_itself, theta, knots, slope_std, own, table)
         from_neighbours = table
     grow_surfaces(frame, theta, observation, growth, odds, from_neighbours, 1, by_itself)
-    if looks_aside:
+    if uses_neighbours:
         _find_evidence(by_itself, theta, knots, slope_std, own, table)
     _combine(by_itself, from_neighbours, theta, knots, slope_std, frame.prior_mean, mean, std)
 
@@ -72,7 +72,7 @@ def _find_seeds(
     table: FloatArray,
     seed: BoolArray,
 ) -> float:
-    """Do what `seeds` of the twin does, into `seed`; `max_slope` < 0: segments do not look aside.
+    """Do what `seeds` of the twin does, into `seed`; `max_slope` < 0: no neighbours are used.
 
     Returns the odds of obstacles; `table` (M, K) is overwritten.
     """

@@ -285,7 +285,7 @@ def _grow(
         n_new = 0
         for i in range(done, len(inlier)):
             precision = columns.neighbour_precision[i]
-            # Before anything has joined, only evidence from aside decides.
+            # Before anything has joined, only the evidence of neighbours decides.
             if inlier[i] or (n_inliers == 0 and precision == 0.0):
                 continue
             follows = i > 0 and inlier[i - 1] and continues_line[i] and not columns.above[i]

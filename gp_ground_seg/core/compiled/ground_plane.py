@@ -21,6 +21,7 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     Plane,
     crossed_at,
     distance,
+    fit_cells,
     levelness,
     refutation_by,
     segment_directions,
@@ -52,7 +53,13 @@ _PER_METRE = 4.0 / float(RING_EDGES[1] - RING_EDGES[0])
 _STARTS = RING_EDGES[0] + (np.arange(int(RING_EDGES[-1] * _PER_METRE) + 1) - 0.02) / _PER_METRE
 _RING_TABLE = np.clip(np.searchsorted(RING_EDGES, _STARTS, side='right') - 1, 0, N_RINGS - 1)
 
-_fit_cells = jit(entry=True)(ground_plane.fit_cells)
+
+@jit(entry=True)
+def _fit_cells(
+    cells: LowestPoints, n: int, max_slope: float, origin: Direction
+) -> tuple[float, ...]:
+    """Fields of the `GroundPlane`."""
+    return fit_cells(cells, n, max_slope, origin)[:]
 
 
 def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> GroundPlane | None:
@@ -63,8 +70,8 @@ def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> Gr
     cells = LowestPoints(x, y, z, r, tolerance, inverse, weight, number, lowest_z)
     n = _tabulate(candidates, directions, cells)
     cells = LowestPoints._make(column[: -(-n // WIDTH) * WIDTH] for column in cells)
-    numbers = _fit_cells(cells, n, max_slope, origin)
-    return GroundPlane(*numbers) if numbers[-1] > 0 else None
+    plane = GroundPlane(*_fit_cells(cells, n, max_slope, origin))  # type: ignore[arg-type]
+    return plane if plane.n_support > 0 else None
 
 
 @jit(entry=True)

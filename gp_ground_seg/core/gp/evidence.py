@@ -30,7 +30,7 @@ LEAST_PRECISION = 1e-3
 
 
 ODDS = 0.25
-"""Least obstacles for each ground among the candidates."""
+"""Lower bound of the odds that a candidate is an obstacle."""
 
 
 class Evidence(NamedTuple):
@@ -63,7 +63,7 @@ def contradicts(height: Values, precision: Values, z: Values, noise: Values) -> 
 def combined(
     height: Values, variance: Values, neighbour_height: Values, neighbour_precision: Values
 ) -> tuple[Values, Values]:
-    """Height and variance of an estimate together with the evidence from aside."""
+    """Height and variance of an estimate together with the evidence of neighbours."""
     variance = np.maximum(variance, 0.0)
     share = 1.0 / (1.0 + variance * neighbour_precision)
     return share * height + (1.0 - share) * neighbour_height, share * variance
@@ -73,7 +73,7 @@ def combined(
 def combined_surface(
     mean: Values, std: Values, prior: Values, neighbour_height: Values, neighbour_precision: Values
 ) -> tuple[Values, Values]:
-    """Height and standard deviation of a surface together with the evidence from aside [m].
+    """Height and standard deviation of a surface together with the evidence of neighbours [m].
 
     NaN where there is neither; `prior` is the variance where there is no surface.
     """
@@ -93,8 +93,8 @@ def combined_surface(
 def shown_by(mean: Values, std: Values, prior: Values) -> tuple[Values, Values]:
     """Height that a surface shows by its observations, and its standard deviation [m].
 
-    What a surface knows by the prior alone is no evidence: its observations are what is left of it
-    divided by the prior, of variance `prior`. 0 and infinite where nothing is left.
+    The prior, of variance `prior`, is divided out, so that neighbours pass on observations only.
+    0 and infinite where nothing is left.
     """
     least = np.maximum(std, LEAST_STD)
     square = least * least

@@ -330,7 +330,7 @@ def _grow(
         predicted = combined(height[:, :n], variance[:, :n], *batch.from_neighbours)
         joining = fits(batch.z, *predicted, batch.gate_noise, growth) | following
         joining &= ~chosen & batch.mask
-        # Before anything has joined, only evidence from aside decides.
+        # Before anything has joined, only the evidence of neighbours decides.
         joining &= chosen.any(axis=1, keepdims=True) | (batch.from_neighbours.precision > 0.0)
         if odds > 0.0:
             doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, batch.in_face, odds)

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import yaml
 
 from gp_ground_seg.core.errors import LOGGER, ConfigError, in_one_line, reason_of
-from gp_ground_seg.core.parameters.removed import removal
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -117,8 +116,6 @@ class ParameterSpec:
                     return float(value)
                 if isinstance(value, numbers.Integral):
                     return int(value)
-        if line := removal(self.name, value):
-            raise ConfigError(line)
         given = repr(value) if len(repr(value)) <= 100 else f'{repr(value)[:100]} ...'
         raise ConfigError(f'{self.name} = {given}: must be {self.accepted}')
 
@@ -189,15 +186,10 @@ class ParameterGroups:
 
     @classmethod
     def find_spec(cls, name: str) -> ParameterSpec:
-        """Return the declaration of one parameter.
-
-        Raises ConfigError with what to use instead, or with the nearest name.
-        """
+        """Return the declaration of one parameter; ConfigError with the nearest name if none."""
         specs = cls.specs()
         if name in specs:
             return specs[name]
-        if line := removal(name):
-            raise ConfigError(line)
         members = [known for known in specs if known.startswith(f'{name}.')]
         if members:
             raise ConfigError(f'{name!r} is a group of parameters: {", ".join(members)}')
@@ -206,10 +198,16 @@ class ParameterGroups:
     def __post_init__(self) -> None:
         """Check every value."""
         checked = {name: spec.check(self[name]) for name, spec in self.specs().items()}
-        for group_name, values in _nest(checked).items():
-            # A whole number given for a float becomes one, in a group of our own.
-            group = dataclasses.replace(getattr(self, group_name), **values)
+        # A whole number given for a float becomes one, in a group of our own.
+        for group_name, group in self._groups(checked).items():
             object.__setattr__(self, group_name, group)
+
+    def _groups(self, values: Mapping[str, object]) -> dict[str, Any]:
+        """Return groups with some values changed, by name."""
+        return {
+            group_name: dataclasses.replace(getattr(self, group_name), **group)
+            for group_name, group in _nest(values).items()
+        }
 
     def __getitem__(self, name: str) -> Any:
         """Value of the parameter with the dotted `name`, in its declared type."""
@@ -229,12 +227,8 @@ class ParameterGroups:
 
         Raises ConfigError if a name is unknown or the changed configuration is invalid.
         """
-        checked = {name: self.find_spec(name).check(value) for name, value in changes.items()}
-        groups: dict[str, Any] = {
-            group_name: dataclasses.replace(getattr(self, group_name), **values)
-            for group_name, values in _nest(checked).items()
-        }
-        return dataclasses.replace(self, **groups)
+        values = {self.find_spec(name).name: value for name, value in changes.items()}
+        return dataclasses.replace(self, **self._groups(values))
 
     @classmethod
     def from_yaml(cls, path: str | Path, base: Self | None = None) -> Self:
@@ -333,9 +327,9 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f'; did you mean {near[0]}?' if near else ''
 
 
-def _nest(flat: Mapping[str, ParameterValue]) -> dict[str, dict[str, ParameterValue]]:
+def _nest(flat: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """``{'group.field': value}`` as ``{group: {field: value}}``."""
-    result: dict[str, dict[str, ParameterValue]] = {}
+    result: dict[str, dict[str, Any]] = {}
     for name, value in flat.items():
         group_name, field_name = name.split('.')
         result.setdefault(group_name, {})[field_name] = value

@@ -54,11 +54,6 @@ REFUTATION = 8.0
 
 Plane = tuple[float, float, float]
 """Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
-NumbersOfPlane = tuple[
-    float, float, float, float, float, float, float, float, float, float, float, float, float,
-    int, int,
-]  # fmt: skip
-"""Fields of a `GroundPlane`."""
 
 N_TRIPLES = 192
 """Planes tried through three cells each."""
@@ -158,30 +153,32 @@ def _lowest(offsets: IntArray, r: FloatArray, z: FloatArray) -> tuple[IntArray, 
 
 
 class GroundPlane(NamedTuple):
-    """The plane z = -height + slope_x x + slope_y y."""
+    """The plane z = -height + slope_x x + slope_y y; `NO_PLANE` if no cell lies on any."""
 
-    height: float  # how far below the origin of the cloud it is, along z [m]
-    slope_x: float  # rise per metre
-    slope_y: float  # rise per metre
+    height: float = 0.0  # how far below the origin of the cloud it is, along z [m]
+    slope_x: float = 0.0  # rise per metre
+    slope_y: float = 0.0  # rise per metre
     # as `height`, for the parallel plane through the middle of the near cells [m]
-    near_height: float
-    support: float  # share of the cells that lie on it
-    near_support: float  # the same of their weights, see `weight_at`
-    coverage: float  # share of all sectors around the sensor with such a cell
-    far_coverage: float  # share of the sectors with any cell that have such a cell `FAR` away
-    reach: float  # range within which nine of ten of these cells are [m]
+    near_height: float = 0.0
+    support: float = 0.0  # share of the cells that lie on it
+    near_support: float = 0.0  # the same of their weights, see `weight_at`
+    coverage: float = 0.0  # share of all sectors around the sensor with such a cell
+    far_coverage: float = (
+        0.0  # share of the sectors with any cell that have such a cell `FAR` away
+    )
+    reach: float = 0.0  # range within which nine of ten of these cells are [m]
     # angle at which the sensor sees nine of ten of these below the plane through it that is
     # parallel to this one, at most [rad]: on a slope not that below the horizon
-    depression: float
+    depression: float = 0.0
     # Difference of the angles of depression, seen from the sensor, of these cells [rad], a tenth
     # of them left out at either end: the lowest beam alone, on walls, makes a cone that looks
     # like a plane.
-    spread: float
+    spread: float = 0.0
     # share of the sectors with any cell where rays to it cross a nearer level that goes on behind
-    seen_through: float
-    residual: float  # root mean square of the distances along z of these cells to it [m]
-    n_cells: int  # how many cells there were
-    n_support: int  # how many of them lie on it
+    seen_through: float = 0.0
+    residual: float = 0.0  # root mean square of the distances along z of these cells to it [m]
+    n_cells: int = 0  # how many cells there were
+    n_support: int = 0  # how many of them lie on it
 
     @property
     def depth(self) -> float:
@@ -204,6 +201,9 @@ class GroundPlane(NamedTuple):
         return np.array(self.normal)
 
 
+NO_PLANE = GroundPlane()
+
+
 def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> GroundPlane | None:
     """Fit the plane that most of the lowest points lie on and few rays cross; None without one.
 
@@ -213,18 +213,18 @@ def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> Gr
     steepest plane to look for, as rise per metre; `origin` is where the sensor is [m].
     """
     cells = lowest_points(candidates)
-    numbers = fit_cells(cells, len(cells.z), max_slope, origin)
-    return GroundPlane(*numbers) if numbers[-1] > 0 else None
+    plane = fit_cells(cells, len(cells.z), max_slope, origin)
+    return plane if plane.n_support > 0 else None
 
 
 @shared
-def fit_cells(cells: LowestPoints, n: int, max_slope: float, origin: Direction) -> NumbersOfPlane:
-    """Fit a plane to the first `n` points; its last number is 0 if there is none."""
+def fit_cells(cells: LowestPoints, n: int, max_slope: float, origin: Direction) -> GroundPlane:
+    """Fit a plane to the first `n` points."""
     is_found, best = False, (0.0, 0.0, 0.0)
     if n >= MIN_CELLS:
         is_found, best = best_hypothesis(cells, n, max_slope, origin)
     if not is_found:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
+        return NO_PLANE
     plane = refined(cells, best)
     if not is_possible(plane, LOOSER * max_slope):
         # The refinement has drifted off to a plane that cannot be the ground.
@@ -438,8 +438,8 @@ def solve_plane(moments: Moments, plane: Plane) -> Plane:
 
 
 @shared
-def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> NumbersOfPlane:
-    """Fields of the `GroundPlane`; the last is 0 if no point lies on it."""
+def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> GroundPlane:
+    """Measure how well a plane is seen."""
     height, slope_x, slope_y = plane
     ranges, drops, near, angles = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     n_on_it, n_near, squares, weight, whole = 0, 0, 0.0, 0.0, 0.0
@@ -471,17 +471,26 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> N
         if r >= FAR and sector != last_far:
             n_far, last_far = n_far + 1, sector
     if n_on_it == 0:
-        return height, slope_x, slope_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
+        return NO_PLANE
     few, most = n_on_it // 10, (9 * n_on_it) // 10
     lift = ranked(near[:n_near], n_near // 2) if n_near >= ENOUGH_NEAR else 0.0
-    return (
-        height, slope_x, slope_y, height - lift, n_on_it / n, weight / whole,
-        n_covered / N_SECTORS, n_far / n_seen, ranked(ranges[:n_on_it], most),
-        ranked(angles[:n_on_it], most),
-        ranked(drops[:n_on_it], most) - ranked(drops[:n_on_it], few),
-        count_seen_through(cells, n, plane, origin) / n_seen,
-        math.sqrt(squares / n_on_it), n, n_on_it,
-    )  # fmt: skip
+    return GroundPlane(
+        height=height,
+        slope_x=slope_x,
+        slope_y=slope_y,
+        near_height=height - lift,
+        support=n_on_it / n,
+        near_support=weight / whole,
+        coverage=n_covered / N_SECTORS,
+        far_coverage=n_far / n_seen,
+        reach=ranked(ranges[:n_on_it], most),
+        depression=ranked(angles[:n_on_it], most),
+        spread=ranked(drops[:n_on_it], most) - ranked(drops[:n_on_it], few),
+        seen_through=count_seen_through(cells, n, plane, origin) / n_seen,
+        residual=math.sqrt(squares / n_on_it),
+        n_cells=n,
+        n_support=n_on_it,
+    )
 
 
 @shared

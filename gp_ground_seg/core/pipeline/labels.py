@@ -105,8 +105,8 @@ def is_near(height: Values) -> Values:
 def ground_band(roughness: Values, label: LabelConfig) -> Values:
     """Largest height of ground over the surface, where the ground is so rough [m].
 
-    See `gp_ground_seg.core.pipeline.roughness.ground_roughness`: a thing on the ground does not
-    widen the band, since it fills few of the tiles about it.
+    See `gp_ground_seg.core.pipeline.roughness.ground_roughness`: an object on the ground does
+    not widen the band, since it fills few of the tiles about it.
     """
     likely = np.minimum(ROUGHNESS_IN_BAND * roughness, HIGHEST_GROUND)
     return np.maximum(likely, label.ground_tolerance)
@@ -123,7 +123,7 @@ def band_margin(height: Values, band: Values, depth: float) -> Values:
 def face_margin(
     margin: Values, over_lowest: Values, is_occluded: Values, tolerance: float
 ) -> Values:
-    """Return what `band_margin` is of a point in a vertical face, `over_lowest` its lowest [m]."""
+    """Margin of a point in a vertical face [m]; `over_lowest` is its height over the lowest."""
     # With a limit below zero no return of the tile is ground; the margin stays a distance.
     in_face = FACE_SHARE * tolerance * (1.0 - 2.0 * is_occluded) - over_lowest
     # Without a surface `margin` is NaN, and stays so.

@@ -1,8 +1,8 @@
 """Stage 2: lengths in proportion to the height of a low sensor.
 
-To a robot with its sensor at 0.4 m a thing is an obstacle that a car rolls over. And what its
-level beams meet is as high as the sensor: where the gate of the surface is wider than that, far
-from the last ring on the ground, trunks, persons and cars are ground.
+A small robot must stop for objects that a car drives over. Its level beams hit objects at the
+height of the sensor, for example 0.4 m: far from the last ring on the ground, a gate wider than
+that would accept trunks, persons and cars as ground.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Stage 6: roughness of the ground in each tile.
 
-A low thing fills few tiles; rough ground, and ground that the surface does not follow, fill most
-of those about it. So the roughness of a tile is an order statistic of the tiles about it, in two
-windows. In the near one it is that of the rougher tiles: ground is seldom equally rough. In the
-wide one it is the median, and bounds the other: a thing that fills the near window does not fill
-the wide one. Where few tiles are seen, the median of the frame counts as some more.
+A low object fills few tiles; rough ground, and ground that the surface does not follow, fill
+most of those around it. So the roughness of a tile is an order statistic of the tiles around it,
+in two windows. In the near one it is that of the rougher tiles: ground is seldom equally rough. In
+the wide one it is the median, and bounds the other: an object that fills the near window does not
+fill the wide one. Where few tiles are seen, the median of the frame counts as some more.
 """
 
 from __future__ import annotations

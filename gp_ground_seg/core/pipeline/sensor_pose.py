@@ -243,7 +243,7 @@ def _doubts(sensor: SensorConfig, view: View) -> tuple[str, ...]:
     is_little = plane.n_support < FEW_CELLS or plane.coverage < MIN_COVERAGE
     clearance = plane.near_height * plane.normal[2] + _product(view.up, origin_of(sensor))
     is_low = 0.0 < clearance < LOW and plane.depression >= LEAST_DEPRESSION
-    # Of numpy, a truth is no number.
+    # A boolean of numpy does not multiply a tuple.
     return (LOW_GROUND,) * bool(is_low) + (LITTLE_GROUND,) * bool(is_little)
 
 
