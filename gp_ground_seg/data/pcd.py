@@ -23,7 +23,6 @@ from gp_ground_seg.data.clouds import (
     distinct,
     gather,
     in_types,
-    lines_of,
     note,
     read_lines,
     read_table,
@@ -62,7 +61,7 @@ def read_pcd(data: bytes) -> tuple[Fields, PcdHeader]:
         packed = np.dtype([entry for entry in types if not entry[0].startswith('_ ')])
         fields = _read_compressed(rest, packed, width * height)
     elif form == 'ascii':
-        fields = read_lines(lines_of(rest), np.dtype(types), width * height)
+        fields = read_lines(rest, np.dtype(types), width * height)
     elif form == 'binary':
         fields = read_table(rest, np.dtype(types), width * height)
     else:
