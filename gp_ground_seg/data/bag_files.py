@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 from collections import Counter
 from collections.abc import Iterator
@@ -21,7 +20,6 @@ BAG_SUFFIXES = ('.bag', *STORAGE_OF_SUFFIX)
 PACKED_SUFFIXES = ('.zstd', '.zst')
 
 _FOLDER_SUFFIXES = ('.mcap', '.db3', '.db3-shm', '.db3-wal', *PACKED_SUFFIXES)
-_MCAP_MAGIC = b'\x89MCAP0\r\n'
 # Part of an error of reading -> a hint at what to do.
 _NEXT_STEP = {
     'EndOfFile': 'damaged; `mcap recover` saves the readable part',
@@ -37,14 +35,6 @@ def is_bag(path: str | Path) -> bool:
     if candidate.is_dir():
         return (candidate / METADATA_FILE).is_file()
     return candidate.suffix in BAG_SUFFIXES
-
-
-def storage_of(path: Path) -> str:
-    """Storage of a bag: ``ros1``, ``mcap`` or ``sqlite3``."""
-    if path.suffix == '.bag' and not path.is_dir():
-        return 'ros1'
-    files = path.glob('*.db3*') if path.is_dir() else [path]
-    return 'sqlite3' if any('.db3' in file.suffixes for file in files) else 'mcap'
 
 
 def is_bag_folder(path: Path) -> bool:
@@ -97,29 +87,6 @@ def list_files(path: Path) -> tuple[list[Path], dict[str, int], bool]:
     if wrong := [file.name for file in files if not {*file.suffixes} & {*STORAGE_OF_SUFFIX}]:
         raise DataError(f'{metadata}: {", ".join(wrong)}: accepted are .mcap and .db3')
     return files, counts, str(said.get('compression_mode')).lower() == 'message'
-
-
-def check_mcap_file(path: Path) -> None:
-    """Raise ValueError where an MCAP file has no end, or is of ROS 1."""
-    with path.open('rb') as file:
-        start = file.read(25)
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(size - len(_MCAP_MAGIC), 0))
-        end = file.read()
-    if not start.startswith(_MCAP_MAGIC):
-        raise ValueError('no MCAP' if start else 'empty')
-    if end != _MCAP_MAGIC or len(start) < 25:
-        raise ValueError(
-            'truncated, or still being recorded; `mcap recover` saves the readable part'
-        )
-    kind, n_bytes, _, profile = struct.unpack_from('<BQI4s', start, len(_MCAP_MAGIC))
-    if kind != 1 or n_bytes > size:
-        raise ValueError(f'its first record is of kind {kind} and {n_bytes} bytes, of {size}')
-    if profile == b'ros1':
-        raise ValueError(
-            'its profile is ros1; give the .bag that it was made from, or convert that by '
-            '`rosbags-convert --src IN.bag --dst OUT`'
-        )
 
 
 def check_sqlite_path(path: Path) -> None:

@@ -80,16 +80,12 @@ def write_wide(path):
     write_changed(path, width=0, data=np.zeros(0, np.uint8), row_step=0, fields=fields)
 
 
-def long_record(write, place, form):
+def write_long_record(path):
     """Write a bag with a first record that is said to have 3 GB."""
-
-    def write_long(path):
-        write(path)
-        with open(path, 'r+b') as file:
-            file.seek(place)
-            file.write(struct.pack(form, 3_000_000_000))
-
-    return write_long
+    write_ros1_bag(path)
+    with open(path, 'r+b') as file:
+        file.seek(len('#ROSBAG V2.0\n'))
+        file.write(struct.pack('<I', 3_000_000_000))
 
 
 NO_BAG = 'cannot be read as a bag: '
@@ -137,9 +133,7 @@ REFUSED = {
         lambda path: write_changed(path, width=400_000_000), 'bytes: must be at least 8800000000'
     ),
     'wide.db3': (write_wide, '400000004 numbers per point'),
-    # Behind the magic of the format; in MCAP behind the kind of the record as well.
-    'record.mcap': (long_record(write_ros2_bag, 9, '<Q'), NO_BAG),
-    'record.bag': (long_record(write_ros1_bag, len('#ROSBAG V2.0\n'), '<I'), NO_BAG),
+    'record.bag': (write_long_record, NO_BAG),
 }  # fmt: skip
 PEAK = """
 import sys
