@@ -1,7 +1,6 @@
 """Bags: every kind in, rosbag2 out, whole or not at all."""
 
 import sqlite3
-import subprocess
 import sys
 
 import bag_samples as samples
@@ -11,10 +10,15 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosReliability
 from rosbags.typesys import Stores, get_typestore
 
-from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.errors import DataError, MissingDependencyError
 from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag, is_bag_folder, resolve_storage
-from gp_ground_seg.data.bags import BagReader, BagWriter, encode_cloud
-from gp_ground_seg.data.files import leftovers, staged_files
+from gp_ground_seg.data.bags import (
+    BagReader,
+    BagWriter,
+    decode_cloud,
+    encode_cloud,
+    jazzy_types,
+)
 
 SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive.db3', None)]
 
@@ -93,8 +97,8 @@ def test_clouds_of_ros1(tmp_path):
         assert list(bag.messages([topic])) == list(bag.messages()) == expected
         assert bag.topics['/odd'] == 'my_msgs/msg/Odd, ros1'
         assert bag.n_messages('/text') == 6  # of two publishers
-        with pytest.raises(DataError, match=r'/range has messages of .*, ros1; one topic'):
-            next(bag.messages(['/range']))
+        with pytest.raises(DataError, match=r'/text has messages of .*, ros1; one topic'):
+            next(bag.messages(['/text']))
 
 
 def test_several_cloud_topics_are_listed(tmp_path):
@@ -105,10 +109,6 @@ def test_several_cloud_topics_are_listed(tmp_path):
         assert bag.pick_point_cloud_topic('/rear') == '/rear'
         with pytest.raises(DataError, match=r'no topic /left'):
             list(bag.messages(['/left']))
-    samples.write_note(tmp_path / 'none.mcap', 5, 'hello')
-    expected = rf'no {POINT_CLOUD2} topic; topics here: /note \(std_msgs/msg/String\)'
-    with BagReader(tmp_path / 'none.mcap') as bag, pytest.raises(DataError, match=expected):
-        bag.pick_point_cloud_topic()
 
 
 def test_what_a_folder_lacks_is_noticed(tmp_path):
@@ -147,7 +147,6 @@ def test_a_bag_is_replaced_with_force_only_and_by_a_whole_one_only(tmp_path, nam
         with BagWriter(path, storage=storage, force=force) as bag:
             bag.add_topic('/points')
             bag.write('/points', 5, encode_cloud(samples.cloud()))
-            assert leftovers(path)
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
@@ -160,7 +159,6 @@ def test_a_bag_is_replaced_with_force_only_and_by_a_whole_one_only(tmp_path, nam
     with pytest.raises(ZeroDivisionError):
         fail_in_the_middle(force=True)
     assert listing(tmp_path) == files
-    assert not leftovers(path)
     with BagWriter(path, storage=storage, force=True) as bag:
         bag.add_topic('/note', 'std_msgs/msg/String')
         bag.write('/note', 1, samples.string_message('new'))
@@ -168,21 +166,6 @@ def test_a_bag_is_replaced_with_force_only_and_by_a_whole_one_only(tmp_path, nam
         assert read_all(path) == before
     assert read_all(path) == [('/note', 1, samples.string_message('new'))]
     assert [p.name for p in tmp_path.iterdir()] == [name]
-
-
-def test_files_into_an_existing_folder_leave_the_others(tmp_path):
-    (tmp_path / 'mine').write_text('kept')
-    with staged_files(tmp_path, ['a', 'b'], force=False) as folder:
-        (folder / 'a').write_text('1')
-        assert [path.name for path in tmp_path.iterdir()] == ['mine']
-        (folder / 'b').write_text('2')
-    assert listing(tmp_path) == ['a', 'b', 'mine']
-    refused = pytest.raises(DataError, match=r'/b: exists already \(1 of 2 files to write do\)')
-    with refused, staged_files(tmp_path, ['b', 'c'], force=False):
-        pass
-    with staged_files(tmp_path, ['b'], force=True) as folder:
-        (folder / 'b').write_text('3')
-    assert [(tmp_path / name).read_text() for name in ('b', 'mine')] == ['3', 'kept']
 
 
 def test_force_never_replaces_what_is_no_bag(tmp_path):
@@ -207,17 +190,14 @@ def test_output_that_appeared_meanwhile_is_kept(tmp_path, name):
     assert (tmp_path / name).read_text() == "another process's"
 
 
-@pytest.mark.parametrize(
-    ('name', 'storage', 'message'),
-    [
+def test_impossible_output_is_refused(tmp_path):
+    for name, storage, message in (
         ('a.db3', 'mcap', r'ends in \.db3, which is not mcap'),
         ('a#1', 'sqlite3', 'sqlite3 bag cannot have # in its path'),
         ('100%.db3', None, 'sqlite3 bag cannot have % in its path'),
-    ],
-)
-def test_impossible_output_is_refused(tmp_path, name, storage, message):
-    with pytest.raises(DataError, match=message), BagWriter(tmp_path / name, storage=storage):
-        pass
+    ):
+        with pytest.raises(DataError, match=message), BagWriter(tmp_path / name, storage=storage):
+            pass
     assert listing(tmp_path) == []
 
 
@@ -226,8 +206,6 @@ def test_unusual_names_work(tmp_path):
     written = samples.write_ros2_bag(tmp_path / 'a.db3')
     (tmp_path / 'a.db3').rename(tmp_path / 'a#2?.db3')
     assert read_all(tmp_path / 'a#2?.db3') == written
-    (tmp_path / '.a [x].partial-1').mkdir()
-    assert [p.name for p in leftovers(tmp_path / 'a [x]')] == ['.a [x].partial-1']
 
 
 def test_a_topic_is_declared_once_and_has_one_type(tmp_path):
@@ -245,19 +223,10 @@ def test_a_topic_is_declared_once_and_has_one_type(tmp_path):
         next(bag.messages(['/same']))
 
 
-def test_without_rosbags_the_error_says_what_to_install(tmp_path):
-    code = """if True:
-        import sys
-        sys.modules['rosbags'] = None
-        from gp_ground_seg.data import bags
-        from gp_ground_seg.core.errors import MissingDependencyError
-        for call in (bags.BagReader, bags.BagWriter, bags.decode_cloud):
-            try:
-                call('drive.mcap')
-            except MissingDependencyError as error:
-                print(error)
-        """
-    done = subprocess.run(
-        [sys.executable, '-c', code], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.count('pip install rosbags') == 3
+@pytest.mark.parametrize('call', [BagReader, BagWriter, decode_cloud])
+def test_without_rosbags_the_error_says_what_to_install(monkeypatch, call):
+    jazzy_types.cache_clear()
+    monkeypatch.setitem(sys.modules, 'rosbags', None)
+    monkeypatch.delitem(sys.modules, 'rosbags.highlevel')
+    with pytest.raises(MissingDependencyError, match='pip install rosbags'):
+        call('drive.mcap')
