@@ -29,14 +29,6 @@ _NEXT_STEP = {
 }
 
 
-def is_bag(path: str | Path) -> bool:
-    """Whether `path` looks like a bag: a folder with metadata.yaml, or by its suffix."""
-    candidate = Path(path)
-    if candidate.is_dir():
-        return (candidate / METADATA_FILE).is_file()
-    return candidate.suffix in BAG_SUFFIXES
-
-
 def is_bag_folder(path: Path) -> bool:
     """Whether a folder holds a rosbag2 bag and nothing else."""
     return (path / METADATA_FILE).is_file() and all(
@@ -49,11 +41,11 @@ def check_is_bag(path: Path) -> None:
     """Raise `DataError` with the next step if `path` cannot be a bag."""
     if not path.exists():
         raise DataError(f'{path}: no such file or folder')
-    if path.is_dir() and not is_bag(path):
+    if path.is_dir() and not (path / METADATA_FILE).is_file():
         files = sorted(child.name for child in path.iterdir() if child.suffix in BAG_SUFFIXES)
         hint = f'; bag files in it, to be given one by one: {", ".join(files)}' if files else ''
         raise DataError(f'{path}: not a rosbag2 folder (no {METADATA_FILE} in it){hint}')
-    if not is_bag(path):
+    if not path.is_dir() and path.suffix not in BAG_SUFFIXES:
         raise DataError(
             f'{path}: not a bag; accepted are ROS 1 .bag, .mcap, .db3 and rosbag2 folders'
         )

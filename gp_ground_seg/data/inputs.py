@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gp_ground_seg.core.errors import LOGGER, DataError, PointCloudError, shown
 from gp_ground_seg.core.pipeline.points import take_points
-from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
+from gp_ground_seg.data.bag_files import BAG_SUFFIXES, METADATA_FILE
 from gp_ground_seg.data.bags import BagReader, decode_cloud
 from gp_ground_seg.data.cloud_files import (
     FROM_TEXT,
@@ -129,10 +129,12 @@ def list_inputs(
 
 def holds_bag(path: Path) -> bool:
     """Whether `path` is a bag, or a folder that has bag files and no scans in it."""
-    if path.is_dir() and not any(map(_is_scan, path.iterdir())):
-        # `BagReader` says what is missing there.
-        return is_bag(path) or any(child.suffix in BAG_SUFFIXES for child in path.iterdir())
-    return is_bag(path)
+    if not path.is_dir():
+        return path.suffix in BAG_SUFFIXES
+    children = list(path.iterdir())
+    has_bags = any(child.suffix in BAG_SUFFIXES for child in children)
+    # Of bag files without metadata `BagReader` says what is missing.
+    return (path / METADATA_FILE).is_file() or (has_bags and not any(map(_is_scan, children)))
 
 
 def _is_scan(path: Path) -> bool:

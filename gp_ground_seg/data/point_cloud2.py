@@ -18,7 +18,7 @@ import numpy.typing as npt
 from numpy.lib.recfunctions import repack_fields
 from numpy.lib.stride_tricks import as_strided
 
-from gp_ground_seg.core.errors import PointCloudError, in_one_line
+from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.pipeline.points import finite_points, single_precision
 from gp_ground_seg.data.clouds import distinct
 
@@ -89,20 +89,19 @@ def read_fields(cloud: CloudMessage) -> npt.NDArray[np.void]:
     A field of several numbers is a sub-array. Raises PointCloudError as `read_xyz`, and if any
     field cannot be as it is described.
     """
-    names = distinct([field.name for field in cloud.fields])
-    layout: Any = {'names': names, 'formats': [], 'offsets': [], 'itemsize': cloud.point_step}
-    try:
-        for field in cloud.fields:
-            # Some old writers leave count at 0 and mean 1.
-            shape = () if field.count < 2 else (field.count,)
-            layout['formats'].append((_code(cloud, field.datatype), shape))
-            layout['offsets'].append(field.offset)
-            # numpy adds in 32 bits, and would read outside of the data.
-            if problem := _find_problem_of_place(field, cloud.point_step):
-                raise ValueError(f'{field.name} {problem}')
-        dtype = np.dtype(layout)
-    except (KeyError, ValueError) as error:
-        raise PointCloudError(f'point cloud: fields: {in_one_line(error)}') from error
+    for field in cloud.fields:
+        _check_field(field, _CODES, cloud.point_step)
+    dtype = np.dtype(
+        {
+            'names': distinct([field.name for field in cloud.fields]),
+            'formats': [
+                (_code(cloud, field.datatype), field.count if field.count > 1 else ())
+                for field in cloud.fields
+            ],
+            'offsets': [field.offset for field in cloud.fields],
+            'itemsize': cloud.point_step,
+        }
+    )
     points = _view(cloud, dtype).reshape(-1)
     return points.astype(repack_fields(dtype.newbyteorder('=')))
 
@@ -196,33 +195,29 @@ def _views(
                 f'point cloud: {many} named {name}: must have exactly one; fields: {known}'
             )
         (field,) = matches
+        # Some old writers leave count at 0 and mean 1; PCL reads these too.
+        if field.count not in (0, 1):
+            raise PointCloudError(f'point cloud: field {name} has count {field.count}: must be 1')
         _check_field(field, accepted, cloud.point_step)
         views[name] = _view(cloud, _code(cloud, field.datatype), field.offset)
     return views
 
 
 def _check_field(field: Any, accepted: Collection[int], point_step: int) -> None:
-    """Raise PointCloudError unless a field is one number of an accepted type within the point."""
+    """Raise PointCloudError unless a field is of an accepted type and within the point."""
     problem = ''
     if field.datatype not in accepted:
         kind = _DATATYPE_NAMES.get(field.datatype, 'unknown')
         wanted = ' or '.join(f'{_DATATYPE_NAMES[datatype]} ({datatype})' for datatype in accepted)
         problem = f'has datatype {field.datatype} ({kind}): must be {wanted}'
-    # Some old writers leave count at 0 and mean 1; PCL reads these too.
-    elif field.count not in (0, 1):
-        problem = f'has count {field.count}: must be 1'
     else:
-        problem = _find_problem_of_place(field, point_step)
+        n_bytes = max(field.count, 1) * int(_CODES[field.datatype][1])
+        # numpy adds in 32 bits, and would read outside of the data.
+        if not 0 <= field.offset <= point_step - n_bytes:
+            place = f'at offset {field.offset} of {n_bytes} bytes'
+            problem = f'{place}: must end within point_step {point_step}'
     if problem:
         raise PointCloudError(f'point cloud: field {field.name} {problem}')
-
-
-def _find_problem_of_place(field: Any, point_step: int) -> str:
-    """Say that the numbers of a field are not all within the point; empty if they are."""
-    n_bytes = max(field.count, 1) * int(_CODES[field.datatype][1])
-    if 0 <= field.offset <= point_step - n_bytes:
-        return ''
-    return f'at offset {field.offset} of {n_bytes} bytes: must end within point_step {point_step}'
 
 
 def _view(cloud: CloudMessage, code: npt.DTypeLike, offset: int = 0) -> npt.NDArray[Any]:

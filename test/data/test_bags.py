@@ -11,7 +11,7 @@ from rosbags.interfaces import QosReliability
 from rosbags.typesys import Stores, get_typestore
 
 from gp_ground_seg.core.errors import DataError, MissingDependencyError
-from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag, is_bag_folder, resolve_storage
+from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag_folder, resolve_storage
 from gp_ground_seg.data.bags import (
     BagReader,
     BagWriter,
@@ -19,6 +19,7 @@ from gp_ground_seg.data.bags import (
     encode_cloud,
     jazzy_types,
 )
+from gp_ground_seg.data.inputs import holds_bag
 
 SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive.db3', None)]
 
@@ -36,7 +37,7 @@ def listing(folder):
 def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
     path = tmp_path / name
     written = samples.write_ros2_bag(path, storage=storage, silent=('/silent',))
-    assert is_bag(path)
+    assert holds_bag(path)
     with BagReader(path) as bag:
         clouds = dict.fromkeys(('/points', '/silent'), POINT_CLOUD2)
         assert bag.topics == {**clouds, '/note': 'std_msgs/msg/String'}

@@ -100,7 +100,7 @@ def test_what_a_format_beside_its_points_says_is_kept(tmp_path):
 
 NAMES = (
     'a_b', 'a b', 'a  b', 'a_0', 'a', 'a 1', 'label', 'gp_label', '_', ' ', 'X', 'höhe', '高さ',
-    'points', 'file', 'allow_pickle', 'self',
+    'points', 'self',
 )  # fmt: skip
 
 

@@ -118,7 +118,8 @@ REFUSED = {
     'wide.pcd': (four(count='500000000', WIDTH='0', POINTS='0'), '500000003 numbers per point'),
     'bytes.pcd': (four('8', count='900', WIDTH='0', POINTS='0').replace(b' a\n', b' _\n')
                   .replace(b'900', b'900000000'), '7200000012 bytes per point'),
-    'size.pcd': (four('2147483647'), 'SIZE 2147483647: must be a whole number, at most 65536'),
+    'size.pcd': (four('2147483647'), 'field a: no type F of 2147483647 bytes'),
+    'count.pcd': (four(count='9' * 11), 'COUNT 99999999999: must be a whole number, at most 4'),
     'no_number.pcd': (pcd(WIDTH=''), 'WIDTH : must be a whole number'),
     'type.pcd': (pcd(types='X F F'), 'field x: no type X of 4 bytes'),
     'data.pcd': (pcd(data='other'), 'DATA other: must be'),
