@@ -211,26 +211,20 @@ def read_lines(text: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
         raise PointCloudError(
             f'a line of {n_words} words, its header says {wanted}, separated by spaces'
         )
-    columns, stop = {}, 0
+    columns: Columns = {}
+    stop = 0
     for name in dtype.names or ():
-        start, stop = stop, stop + math.prod(dtype[name].shape)
-        values = _read_column(lines, name, dtype[name].base, range(start, stop))
-        if values is not None:
-            columns[name] = values.reshape(-1, *dtype[name].shape)
+        own, shape = dtype[name].base, dtype[name].shape
+        start, stop = stop, stop + math.prod(shape)
+        for kind in (own, np.dtype('f8')):
+            with suppress(ValueError, TypeError):
+                values = np.loadtxt(lines, kind, None, usecols=range(start, stop), ndmin=2)
+                columns[name] = values.reshape(-1, *shape)
+                break
+        if name not in columns:
+            if name in _COORDINATES:
+                raise PointCloudError(f'field {name}: has what is no number')
+            note(f'field {name}: has what is no number; left out')
+        elif columns[name].dtype != own:
+            note(f'field {name}: has numbers that are no {own}; read as float64')
     return gather(columns)
-
-
-def _read_column(
-    lines: Sequence[bytes], name: str, dtype: np.dtype[Any], used: range
-) -> npt.NDArray[Any] | None:
-    """Numbers of a field, (N, M), float64 if they are no such integers; None if no numbers."""
-    for kind in (dtype, np.dtype('f8')) if dtype.kind in 'iu' else (dtype,):
-        with suppress(ValueError, TypeError):
-            values = np.loadtxt(lines, kind, comments=None, usecols=used, ndmin=2)
-            if kind != dtype:
-                note(f'field {name}: has numbers that are no {dtype}; read as float64')
-            return values
-    if name in _COORDINATES:
-        raise PointCloudError(f'field {name}: has what is no number')
-    note(f'field {name}: has what is no number; left out')
-    return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -61,20 +61,16 @@ class Inputs:
     """
 
     def __init__(
-        self,
-        path: Path,
-        items: Sequence[Input],
-        topic: str | None = None,
-        n_messages: int = 0,
+        self, path: Path, items: Sequence[Input], topic: str | None = None, n_messages: int = 0
     ) -> None:
         self.path = path
         self.topic = topic  # of a bag, else None
         self._items = items
-        self._length = n_messages or len(items)
+        self._n_messages = n_messages
 
     def __len__(self) -> int:
         """Count the clouds."""
-        return self._length
+        return self._n_messages or len(self._items)
 
     def __iter__(self) -> Iterator[Input]:
         """Yield each cloud, not read yet."""
@@ -119,11 +115,11 @@ def list_inputs(
     if topic is not None:
         raise DataError(f'--topic: is for bags, which {source} is not')
     files = _find_files(path)
-    stems = [_stem(file) for file in files]
-    clashing = {stem for stem, n in Counter(stems).items() if n > 1}
-    names = [f.name if stem in clashing else stem for f, stem in zip(files, stems, strict=True)]
-    pairs = zip(names, files, strict=True)
-    items = [Input(n, shown(f.name), f, partial(read_file, f, columns)) for n, f in pairs]
+    stems = Counter(map(_stem, files))
+    items = []
+    for file in files:
+        name = _stem(file) if stems[_stem(file)] == 1 else file.name
+        items.append(Input(name, shown(file.name), file, partial(read_file, file, columns)))
     return Inputs(path, items)
 
 
@@ -172,20 +168,16 @@ def _find_files(source: Path) -> Sequence[Path]:
 def _without_output(files: Sequence[Path]) -> Sequence[Path]:
     """Leave out files that are named as the output of another one."""
     stems = {_stem(file) for file in files}
-    kept = [file for file in files if not _is_output(_stem(file), stems)]
+    sources = {stem: _OUTPUT.sub('', stem) for stem in stems}
+    outputs = {stem for stem, source in sources.items() if source != stem and source in stems}
+    kept = [file for file in files if _stem(file) not in outputs]
     if n_left_out := len(files) - len(kept):
         LOGGER.info('output of earlier runs left out: %d of %d files', n_left_out, len(files))
     return kept
 
 
-def _is_output(stem: str, stems: Set[str]) -> bool:
-    source = _OUTPUT.sub('', stem)
-    return source != stem and source in stems
-
-
 def _stem(path: Path) -> str:
-    name = path.name
-    return name.removesuffix(NUSCENES_SUFFIX) if name.endswith(NUSCENES_SUFFIX) else path.stem
+    return path.stem.removesuffix('.pcd') if path.name.endswith(NUSCENES_SUFFIX) else path.stem
 
 
 def _decode(raw: bytes, place: str) -> Cloud:

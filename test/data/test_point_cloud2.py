@@ -22,7 +22,7 @@ from gp_ground_seg.data.bags import (
     stamp_of,
     with_stamp,
 )
-from gp_ground_seg.data.point_cloud2 import read_columns, read_xyz
+from gp_ground_seg.data.point_cloud2 import read_columns, read_fields, read_xyz
 
 FLOAT32, FLOAT64 = 7, 8
 STRUCT_CODES = dict(enumerate('bBhHiIfd', 1))
@@ -183,61 +183,51 @@ def test_what_is_not_needed_is_not_checked():
     )
 
 
-def in_z(**changes):
-    return {'fields': replaced('z', **changes)}
+def field(name, /, **changes):
+    return {'fields': replaced(name, **changes)}
 
 
-@pytest.mark.parametrize(
-    ('changes', 'message'),
-    [
-        ({'fields': []}, r'no field named x: must have exactly one; fields: none'),
-        (in_z(name='height'), r'no field named z.*x, y, height, intensity'),
-        ({'fields': replaced('intensity', name='y')}, r'2 fields named y: must have exactly one'),
-        (in_z(datatype=4), r'z has datatype 4 \(UINT16\): must be FLOAT32 \(7\) or FLOAT64 \(8\)'),
-        (in_z(datatype=77), r'field z has datatype 77 \(unknown\)'),
-        (in_z(count=3), r'field z has count 3: must be 1'),
-        (in_z(offset=13), r'z at offset 13 of 4 bytes.*point_step 16'),
-        (in_z(offset=-4), r'z at offset -4'),
-        ({'point_step': 0}, r'point_step 0: must be at least 1'),
-        ({'width': 6}, r'data of 80 bytes: must be at least 96 \(height 1, width 6'),
-        ({'data': b''}, r'data of 0 bytes: must be at least 80'),
-        ({'height': 5, 'width': 1, 'row_step': 15}, r'row_step 15: must be at least 16 \(width 1'),
-        ({'height': 2, 'row_step': 2**32 - 1}, r'data of 80 bytes: must be at least'),
-        ({'row_step': 81}, r'row_step 81: must be at most the 80 bytes of data'),
-    ],
-)
-def test_malformed_layout_says_what_and_where(changes, message):
+def append(layout):
+    return point_cloud2.append_columns(layout, {'a': np.ones(5, np.uint8)})
+
+
+def selecting(mask):
+    return lambda layout: point_cloud2.select_rows(layout, mask)
+
+
+ALL = selecting(np.ones(5, bool))
+WRONG = [
+    (read_xyz, {'fields': []}, r'no field named x: must have exactly one; fields: none'),
+    (read_xyz, field('z', name='up'), r'no field named z.*x, y, up, intensity'),
+    (read_xyz, field('intensity', name='y'), r'2 fields named y: must have exactly one'),
+    (read_xyz, field('z', datatype=4),
+     r'z has datatype 4 \(UINT16\): must be FLOAT32 \(7\) or FLOAT64 \(8\)'),
+    (read_xyz, field('z', datatype=77), r'field z has datatype 77 \(unknown\)'),
+    (read_xyz, field('z', count=3), r'field z has count 3: must be 1'),
+    (read_xyz, field('z', offset=13), r'z at offset 13 of 4 bytes.*point_step 16'),
+    (read_xyz, field('z', offset=-4), r'z at offset -4'),
+    (read_xyz, {'point_step': 0}, r'point_step 0: must be at least 1'),
+    (read_xyz, {'width': 6}, r'data of 80 bytes: must be at least 96 \(height 1, width 6'),
+    (read_xyz, {'height': 5, 'width': 1, 'row_step': 15}, r'row_step 15: must be at least 16'),
+    (read_xyz, {'height': 2, 'row_step': 2**32 - 1}, r'data of 80 bytes: must be at least'),
+    (read_xyz, {'row_step': 81}, r'row_step 81: must be at most the 80 bytes of data'),
+    # numpy adds in 32 bits: an offset of 2^31 - 1 ended the process.
+    *((read_fields, field('intensity', offset=offset, count=count),
+       f'intensity at offset {offset} .*point_step 16')
+      for offset, count in [(13, 1), (12, 2), (2**31 - 1, 1), (4, 2**30)]),
+    (read_fields, field('x', datatype=9), r'field x has datatype 9 \(unknown\)'),
+    (lambda cloud: read_columns(cloud, ['z']), {'width': 0, **field('z', count=2)}, 'count 2'),
+    (ALL, {'data': bytes(70)}, r'data of 70 bytes: must be at least 80'),
+    (append, {'data': bytes(70)}, r'data of 70 bytes: must be at least 80'),
+    (selecting(np.ones(4, bool)), {}, r'mask of shape \(4,\).*bool of shape \(5,\)'),
+    (selecting(np.ones(5, np.uint8)), {}, 'type uint8'),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(('call', 'changes', 'message'), WRONG)
+def test_what_cannot_be_is_refused_and_says_where(call, changes, message):
     with pytest.raises(PointCloudError, match=message):
-        read_xyz(kitti_layout(**changes))
-
-
-@pytest.mark.parametrize(
-    'changes', [{'name': 'w'}, {'name': 'x'}, {'count': 2}, {'offset': 14}, {'datatype': 9}]
-)
-@pytest.mark.parametrize('n_points', [0, 5])
-def test_a_column_that_is_no_single_number_is_refused(changes, n_points):
-    with pytest.raises(PointCloudError, match=r'point cloud: .*field'):
-        read_columns(kitti_layout(width=n_points, **in_z(**changes)), ['x', 'z'])
-
-
-@pytest.mark.parametrize(('offset', 'count'), [(13, 1), (12, 2), (2**31 - 1, 1), (4, 2**30)])
-def test_a_field_beyond_its_point_is_refused_where_every_field_is_read(offset, count):
-    """numpy adds in 32 bits: an offset of 2^31 - 1 ended the process."""
-    fields = replaced('intensity', offset=offset, count=count)
-    with pytest.raises(PointCloudError, match=f'intensity at offset {offset} .*point_step 16'):
-        point_cloud2.read_fields(kitti_layout(fields=fields))
-
-
-def test_select_and_append_refuse_what_they_cannot_read():
-    keep, short = np.ones(5, dtype=bool), kitti_layout(data=bytes(70))
-    with pytest.raises(PointCloudError, match=r'data of 70 bytes: must be at least 80'):
-        point_cloud2.select_rows(short, keep)
-    with pytest.raises(PointCloudError, match=r'data of 70 bytes: must be at least 80'):
-        point_cloud2.append_columns(short, {'a': keep.astype(np.uint8)})
-    with pytest.raises(PointCloudError, match=r'mask of shape \(4,\).*bool of shape \(5,\)'):
-        point_cloud2.select_rows(kitti_layout(), keep[:4])
-    with pytest.raises(PointCloudError, match=r'type uint8'):
-        point_cloud2.select_rows(kitti_layout(), keep.astype(np.uint8))
+        call(kitti_layout(**changes))
 
 
 def assert_same_cloud(cloud, expected):
