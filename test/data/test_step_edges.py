@@ -13,7 +13,7 @@ from gp_ground_seg.data.bags import cloud_from_columns
 from gp_ground_seg.data.costmap import DIRECTIONS, OCCUPIED, SegmentedCloud
 from gp_ground_seg.data.step_edges import SECTORS, find_edges
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
-from gp_ground_seg.lab.simulation.objects import car, wall
+from gp_ground_seg.lab.simulation.objects import car
 from gp_ground_seg.lab.simulation.scenes import Scene
 from gp_ground_seg.lab.simulation.terrain import Sum, polyline, ramp, rough
 
@@ -221,14 +221,6 @@ def test_a_drop_in_uneven_ground_is_found():
     r, distance = edges_of(Sum((drop(6.0, 0.6), uneven)), MOUNTED['hdl-64e']), distance_to(6.0)
     towards = distance <= 10.0
     assert (r[towards] <= distance[towards] + 0.3).mean() >= 0.9
-
-
-def test_a_wall_hides_where_the_ground_falls():
-    terrain = drop(6.05, 0.6)
-    hidden = wall(terrain, (5.9, -4.0), (5.9, 4.0), 0.5)
-    r = edges_of(Scene('', terrain, hidden), MOUNTED['hdl-64e'])
-    assert np.isinf(r[np.abs(MIDDLE) < 0.5]).all()
-    assert np.isfinite(r[(np.abs(MIDDLE) > 0.7) & (np.abs(MIDDLE) < 0.9)]).mean() > 0.9
 
 
 def level_scan(lower=()):
