@@ -54,9 +54,8 @@ def jazzy_types() -> Any:
 
 
 class _Channel(NamedTuple):
-    """Messages of one topic, type and encoding in one file; `key` is its number there."""
+    """Messages of one topic, type and encoding in one file."""
 
-    key: int
     topic: str
     msgtype: str
     encoding: str
@@ -69,10 +68,10 @@ class _Channel(NamedTuple):
         return ', '.join(filter(None, parts))
 
 
-# Gives the key, recorded time [ns] and bytes of each message of the channels with these keys.
-_Read = Callable[[Collection[int]], Iterator[tuple[int, int, bytes]]]
-_Storage = tuple[list[_Channel], _Read]
-"""Of one file of a bag."""
+_Messages = Iterator[tuple[str, int, bytes]]
+"""Topic, recorded time [ns] and bytes of each."""
+_Storage = tuple[list[_Channel], Callable[[Collection[str]], _Messages]]
+"""Channels of one file of a bag, and what reads the CDR messages of some topics in it."""
 
 
 def _open_ros1(path: Path, stack: ExitStack) -> _Storage:
@@ -83,14 +82,16 @@ def _open_ros1(path: Path, stack: ExitStack) -> _Storage:
     bag.open()
     stack.callback(bag.close)
 
-    def read(keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        for connection, time, raw in bag.messages([c for c in bag.connections if c.id in keys]):
-            yield connection.id, time, jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2)
+    clouds = [c for c in bag.connections if c.msgtype == POINT_CLOUD2]
+
+    def read(topics: Collection[str]) -> _Messages:
+        for c, time, raw in bag.messages([c for c in clouds if c.topic in topics]):
+            yield c.topic, time, jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2)
 
     channels = []
     for c in bag.connections:
-        encoding = 'cdr' if c.msgtype == POINT_CLOUD2 else 'ros1'
-        channels.append(_Channel(c.id, c.topic, c.msgtype, encoding, c.msgcount))
+        encoding = 'cdr' if c in clouds else 'ros1'
+        channels.append(_Channel(c.topic, c.msgtype, encoding, c.msgcount))
     return channels, read
 
 
@@ -99,17 +100,19 @@ def _open_sqlite(path: Path, stack: ExitStack) -> _Storage:
     check_sqlite_file(path)
     address = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
     bag = stack.enter_context(closing(sqlite3.connect(address, uri=True, check_same_thread=False)))
-    counts = dict(bag.execute('SELECT topic_id, count(*) FROM messages GROUP BY topic_id'))
-    topics = bag.execute('SELECT id, name, type, serialization_format FROM topics')
-    channels = [
-        _Channel(n, topic, kind, form, counts.get(n, 0)) for n, topic, kind, form in topics
-    ]
+    rows = bag.execute(
+        'SELECT name, type, serialization_format, count(topic_id) FROM topics '
+        'LEFT JOIN messages ON topics.id = topic_id GROUP BY topics.id'
+    )
+    channels = [_Channel(*row) for row in rows]
 
-    def read(keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        wanted = ', '.join(str(int(key)) for key in keys)
+    def read(topics: Collection[str]) -> _Messages:
+        chosen = f"name IN ({', '.join('?' * len(topics))}) AND serialization_format = 'cdr'"
         yield from bag.execute(
-            'SELECT topic_id, timestamp, data FROM messages '
-            f'WHERE topic_id IN ({wanted}) ORDER BY timestamp'
+            'SELECT (SELECT name FROM topics WHERE topics.id = topic_id), timestamp, data '
+            f'FROM messages WHERE topic_id IN (SELECT id FROM topics WHERE {chosen}) '
+            'ORDER BY timestamp, id',
+            list(topics),
         )
 
     return channels, read
@@ -145,16 +148,15 @@ def _open_mcap(path: Path, stack: ExitStack) -> _Storage:
             counts[channel.id] += 1
             channels[channel.id], schemas[channel.schema_id] = channel, schema
 
-    def read(keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        topics = {channels[key].topic for key in keys}
+    def read(topics: Collection[str]) -> _Messages:
         for _, channel, message in bag.iter_messages(topics, log_time_order=is_indexed):
-            if channel.id in keys:
-                yield channel.id, message.log_time, message.data
+            if channel.message_encoding == 'cdr':
+                yield channel.topic, message.log_time, message.data
 
     found = []
     for c in channels.values():
         msgtype = schemas[c.schema_id].name if c.schema_id else ''
-        found.append(_Channel(c.id, c.topic, msgtype, c.message_encoding, counts.get(c.id, 0)))
+        found.append(_Channel(c.topic, msgtype, c.message_encoding, counts.get(c.id, 0)))
     return found, read
 
 
@@ -247,7 +249,7 @@ class BagReader(AbstractContextManager['BagReader']):
             problem = f'no {POINT_CLOUD2} topic; topics here: {self._list_topics()}'
         raise DataError(f'{self.path}: {problem}')
 
-    def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, bytes]]:
+    def messages(self, topics: Collection[str] | None = None) -> _Messages:
         """Topic, recorded time [ns] and CDR bytes of each message, by default of all in CDR.
 
         In order of their time; file after file in a split bag. Raises DataError if a topic is
@@ -263,12 +265,10 @@ class BagReader(AbstractContextManager['BagReader']):
                     'one topic must have one type, and be in CDR'
                 )
         found: Counter[str] = Counter()
-        for channels, read in self._storages:
-            chosen = [c for c in channels if c.topic in expected and c.encoding == 'cdr']
-            names = {channel.key: channel.topic for channel in chosen}
-            for key, time, raw in self._read(read(names)) if names else ():
-                found[names[key]] += 1
-                yield names[key], time, raw
+        for _, read in self._storages:
+            for name, time, raw in self._read(read(expected)) if expected else ():
+                found[name] += 1
+                yield name, time, raw
         for name, n_messages in expected.items():
             if found[name] != n_messages:
                 raise DataError(
@@ -277,18 +277,18 @@ class BagReader(AbstractContextManager['BagReader']):
                     f'or its {METADATA_FILE} belongs to another one'
                 )
 
-    def _read(self, source: Iterator[tuple[int, int, bytes]]) -> Iterator[tuple[int, int, bytes]]:
+    def _read(self, source: _Messages) -> _Messages:
         """Messages of one file, unpacked; what goes wrong is a DataError."""
         while True:
             # Errors of the caller, raised at the yield, must not pass through here.
             with reading(self.path):
-                if (entry := next(source, None)) is None:
+                if (message := next(source, None)) is None:
                     return
-                key, time, raw = entry
+                name, time, raw = message
                 if self._is_packed:
                     unpacker = require('zstandard', 'mcap').ZstdDecompressor()
                     raw = unpacker.decompressobj().decompress(raw)
-            yield key, time, bytes(raw)
+            yield name, time, bytes(raw)
 
 
 class BagWriter:
