@@ -117,31 +117,6 @@ def write_xyz(cloud: CloudMessage, xyz: npt.NDArray[np.floating]) -> None:
                 column[...] = values.reshape(column.shape)
 
 
-def select_rows(
-    cloud: CloudMessage,
-    mask: npt.NDArray[np.bool_],
-    make_data: Callable[[int], Any] = lambda size: np.empty(size, np.uint8),
-) -> Any:
-    """Every byte of the points where `mask`, (height * width,) bool, is true, in one row.
-
-    `make_data` makes what holds so many bytes.
-    """
-    size = cloud.height * cloud.width
-    if mask.shape != (size,) or mask.dtype != np.bool_:
-        raise PointCloudError(
-            f'mask of shape {mask.shape} and type {mask.dtype}: '
-            f'must be bool of shape ({size},), one per point'
-        )
-    index = np.flatnonzero(mask)
-    data = make_data(len(index) * cloud.point_step)
-    if len(index):
-        # Whole points are 10 times as fast to move as bytes. In any other mode numpy fills an
-        # array of its own first.
-        points = _view(cloud, f'V{cloud.point_step}').reshape(-1)
-        points.take(index, out=np.frombuffer(data, points.dtype), mode='clip')
-    return data
-
-
 def append_columns(
     cloud: CloudMessage, columns: Mapping[str, npt.NDArray[Any]]
 ) -> tuple[list[tuple[str, int, int]], int, npt.NDArray[np.uint8]]:
@@ -252,16 +227,29 @@ def select_points(
     *,
     are_finite: bool = False,
 ) -> _Message:
-    """Message of the points where `mask` is true: same header, same fields, one row.
+    """Message of the points where `mask`, (height * width,) bool, is true, with all their bytes.
 
-    ``is_dense`` says whether the kept points are all finite; they are looked at unless the caller
-    knows that they `are_finite`. `make_data` makes what the message holds so many bytes in.
-    Raises as `select_rows` and `read_xyz` do.
+    It has the same header and fields, and one row. ``is_dense`` says whether the kept points are
+    all finite; they are looked at unless the caller knows that they `are_finite`. `make_data`
+    makes what the message holds so many bytes in. Raises PointCloudError for another mask, and as
+    `read_xyz` does.
     """
+    size = cloud.height * cloud.width
+    if mask.shape != (size,) or mask.dtype != np.bool_:
+        raise PointCloudError(
+            f'mask of shape {mask.shape} and type {mask.dtype}: '
+            f'must be bool of shape ({size},), one per point'
+        )
+    index = np.flatnonzero(mask)
     kept = copy(cloud)
-    kept.data = select_rows(cloud, mask, make_data)
-    kept.height, kept.width = 1, int(np.count_nonzero(mask))
+    kept.height, kept.width = 1, len(index)
     kept.row_step = kept.width * cloud.point_step
+    kept.data = make_data(kept.row_step)
+    if len(index):
+        # Whole points are 10 times as fast to move as bytes. In any other mode numpy fills an
+        # array of its own first.
+        points = _view(cloud, f'V{cloud.point_step}').reshape(-1)
+        points.take(index, out=np.frombuffer(kept.data, points.dtype), mode='clip')
     kept.is_dense = are_finite or bool(finite_points(read_xyz(kept)).all())
     return kept
 

@@ -38,7 +38,8 @@ class Field(NamedTuple):
     count: int = 1
 
 
-class Layout(NamedTuple):
+@dataclasses.dataclass
+class Layout:
     """The attributes of a message that are read."""
 
     height: int
@@ -99,13 +100,10 @@ def test_coordinates_and_selections_agree_with_struct(case, random):
         xyz = xyz.astype(np.float64)
     np.testing.assert_array_equal(xyz, np.reshape(expected, (-1, 3)))
     mask = np.array([random.random() < 0.5 for _ in points], dtype=bool)
-    selected = point_cloud2.select_rows(layout, mask)
-    assert selected.tobytes() == b''.join(itertools.compress(points, mask))
-    # Whatever is not kept is in the complement: nothing is lost or doubled.
-    assert (
-        len(selected) + len(point_cloud2.select_rows(layout, ~mask))
-        == len(points) * layout.point_step
-    )
+    for chosen in (mask, ~mask):
+        selected = point_cloud2.select_points(layout, chosen, bytearray, are_finite=True)
+        assert selected.data == b''.join(itertools.compress(points, chosen))
+        assert (selected.height, selected.width) == (1, chosen.sum())
 
 
 @given(layouts(), st.data())
@@ -137,8 +135,8 @@ def test_points_stay_and_columns_follow(case, data):
             (value,) = struct.unpack_from(order + STRUCT_CODES[datatype], new, offset)
             np.testing.assert_equal(np.array(value, TYPES[datatype]), columns[name][k])
 
-    wider = layout._replace(
-        fields=[Field(*column) for column in placed], data=bytes(wide),
+    wider = dataclasses.replace(
+        layout, fields=[Field(*column) for column in placed], data=bytes(wide),
         point_step=step, row_step=layout.width * step,
     )  # fmt: skip
     found = read_columns(wider, list(columns))
@@ -152,7 +150,7 @@ def kitti_layout(n=5, **changes):
     rng = np.random.default_rng(0)
     fields = [Field(name, 4 * k, FLOAT32) for k, name in enumerate(('x', 'y', 'z', 'intensity'))]
     data = rng.normal(size=(n, 4)).astype('<f4').tobytes()
-    return Layout(1, n, fields, False, 16, 16 * n, data)._replace(**changes)
+    return dataclasses.replace(Layout(1, n, fields, False, 16, 16 * n, data), **changes)
 
 
 def replaced(name, /, **changes):
@@ -173,14 +171,11 @@ def test_coordinates_side_by_side_are_not_copied():
 def test_what_is_not_needed_is_not_checked():
     empty = Layout(0, 0, [], False, 0, 0, b'')
     assert read_xyz(empty).shape == (0, 3)
-    assert len(point_cloud2.select_rows(empty, np.zeros(0, dtype=bool))) == 0
     cloud = cloud_from_columns((0, 0), 'lidar', {})
     assert point_cloud2.select_points(cloud, np.zeros(0, dtype=bool)).width == 0
     layout = kitti_layout(row_step=0)
     np.testing.assert_array_equal(read_xyz(layout), read_xyz(kitti_layout()))
-    assert (
-        point_cloud2.select_rows(layout, np.ones(5, dtype=bool)).tobytes() == kitti_layout().data
-    )
+    assert ALL(layout).data.tobytes() == kitti_layout().data
 
 
 def field(name, /, **changes):
@@ -192,7 +187,7 @@ def append(layout):
 
 
 def selecting(mask):
-    return lambda layout: point_cloud2.select_rows(layout, mask)
+    return lambda layout: point_cloud2.select_points(layout, mask)
 
 
 ALL = selecting(np.ones(5, bool))
