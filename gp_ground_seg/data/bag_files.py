@@ -1,4 +1,4 @@
-"""Bags without reading them: paths, damaged files, topics, the wording of errors."""
+"""What is checked before a bag is read or written: its path, metadata.yaml, damaged files."""
 
 from __future__ import annotations
 

@@ -42,12 +42,12 @@ if TYPE_CHECKING:
 NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
 KITTI_COLUMNS = 4
 MIN_COLUMNS = 3
-_OTHER_COLUMNS = range(MIN_COLUMNS, 9)  # that are looked at in doubt
+_OTHER_COLUMNS = range(MIN_COLUMNS, 9)  # that are tried
 
 _MIN_POINTS = 100  # fewer are not judged
-_N_JUDGED = 10_000  # points looked at in a larger scan
-_N_DISTANCES = 2_000  # of successive points, that are looked at
-_SMALLEST = 1e-6  # of a coordinate that can be measured [m]
+_N_JUDGED = 10_000  # points of a larger scan that are judged
+_N_DISTANCES = 2_000  # between successive points, of a larger scan
+_SMALLEST = 1e-6  # coordinate that can be measured [m]
 _MAX_UNMEASURABLE = 0.4  # share of them; z may be zero in a whole scan
 # Three quarters of the points of the other number are that much nearer to the next one than the
 # median of the given number. Beams that fire in turns are far from each other, and every second
@@ -229,7 +229,7 @@ def read_scan(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[np.
 
 
 def find_columns(numbers: npt.NDArray[np.float32], columns: int) -> int:
-    """Return the number of columns with which this is a scan of much nearer points; 0 if none."""
+    """Return the number of columns with which successive points are much nearer; 0 if none."""
     if len(numbers) < _MIN_POINTS * columns:
         return 0
     fitting = [n for n in _OTHER_COLUMNS if len(numbers) % n == 0 and columns % n and n % columns]
@@ -242,7 +242,7 @@ def find_columns(numbers: npt.NDArray[np.float32], columns: int) -> int:
 
 
 def _distance(numbers: npt.NDArray[np.float32], columns: int, share: float) -> float:
-    """Distance [m] that this share of successive finite points is not beyond; or infinity."""
+    """Quantile `share` of the distances [m] of successive finite points; infinity without."""
     xyz = numbers.reshape(-1, columns)[:, :3]
     first = np.arange(0, len(xyz) - 1, 1 + len(xyz) // _N_DISTANCES)
     with np.errstate(all='ignore'):

@@ -21,12 +21,12 @@ Columns = dict[str, npt.NDArray[Any]]
 COLUMNS = ('x', 'y', 'z', 'intensity')
 """Names of the first columns of a table without names; the others are column_5, ..."""
 MAX_NUMBERS = 1000
-"""Numbers of a point that are accepted: a header can name more where there is no point."""
+"""Most numbers of a point: the header of a file without points can name any number."""
 _MAX_HEADER_BYTES = 1 << 16
 _COORDINATES = frozenset('xyzXYZ')
 _LONG = {'i8', 'u8'}
 _NO_NUMBER = re.compile(rb'[-+]?(nan\(\w+\)|1\.#(QNAN|SNAN|IND)\w*)', re.IGNORECASE)
-"""As Windows writes it."""
+"""NaN as programs on Windows write it."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Cloud:
         Points for `GroundSegmenter.segment`: x, y, z [m], the sensor at the origin; of a ``.bin``
         scan (N, 4), with the intensity.
     header : opaque
-        Contents of the file beside the points, with which it is written again; None without.
+        What the file has besides its points, and gets again when it is written; or None.
     """
 
     fields: Fields
@@ -65,7 +65,7 @@ def coordinate_names(names: Collection[str]) -> list[str]:
 
 @functools.cache
 def note(text: str) -> None:
-    """Log it once, however many files it concerns."""
+    """Log a text once, however many files it is about."""
     LOGGER.info(text)
 
 
@@ -177,7 +177,7 @@ def split_header(data: bytes, last: str) -> tuple[list[str], bytes]:
 
 
 def check_size(n_bytes: int, n_points: int, needed: int) -> None:
-    """Raise PointCloudError if so many points of `needed` bytes are not in the file."""
+    """Raise PointCloudError if the points need more bytes than are there."""
     if needed > n_bytes:
         raise PointCloudError(
             f'{n_bytes} bytes behind the header, which says {n_points} points '

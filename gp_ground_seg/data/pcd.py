@@ -37,7 +37,7 @@ _TYPES = {f'{kind}{n}' for kind in 'iu' for n in (1, 2, 4, 8)} | {'f4', 'f8'}
 
 
 class PcdHeader(NamedTuple):
-    """Entries of a header that are kept beside the points."""
+    """Entries of a header that are written again."""
 
     width: int = 0
     height: int = 1

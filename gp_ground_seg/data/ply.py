@@ -1,7 +1,7 @@
 """PLY files, text and binary of either byte order: their vertices, read and written.
 
 Why not plyfile 1.1: its licence is the GPL, this package has Apache's; it needs numpy 2, and reads
-text and lists number by number: 0.5 s for 120,000 points of a text, which take 0.03 s here.
+text number by number, which is slow.
 
 Source: http://paulbourke.net/dataformats/ply/.
 """

@@ -156,7 +156,6 @@ COMMANDS = (
     'plot segment SCAN --azimuth 0 -o OUT.png',
     'kitti-to-bag ROOT --sequence 00 OUT.mcap',
     'evaluate ROOT --json OUT.json',
-    'experiment ablation ROOT --json OUT.json',
 )
 
 
