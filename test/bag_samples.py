@@ -48,12 +48,6 @@ def string_message(text):
     )
 
 
-def write_note(path, time, text, **options):
-    with BagWriter(path, **options) as bag:
-        bag.add_topic('/note', 'std_msgs/msg/String')
-        bag.write('/note', time, string_message(text))
-
-
 def write_ros2_bag(path, n_clouds=3, topics=('/points',), storage=None, silent=(), **changes):
     """Clouds on each topic, a string before every one of them; returns what was written."""
     written = []
@@ -71,8 +65,8 @@ def write_ros2_bag(path, n_clouds=3, topics=('/points',), storage=None, silent=(
     return written
 
 
-def write_ros1_bag(path, n_clouds=3, topic='/kitti/velo/pointcloud', extras=True):
-    """A bag as kitti2bag makes, with a message of a custom type and one ROS 2 changed."""
+def write_ros1_bag(path, n_clouds=3, topic='/kitti/velo/pointcloud'):
+    """A bag as kitti2bag makes, with a message of a custom type, and a topic of two publishers."""
     types = get_typestore(Stores.ROS1_NOETIC)
     types.register(get_types_from_msg(CUSTOM_DEFINITION, CUSTOM))
     new = types.types
@@ -88,20 +82,14 @@ def write_ros1_bag(path, n_clouds=3, topic='/kitti/velo/pointcloud', extras=True
 
             return write
 
-        clouds = connect(topic, POINT_CLOUD2)
-        if extras:
-            odd = connect('/odd', CUSTOM)
-            text = connect('/text', 'std_msgs/msg/String', callerid='/a', latching=1)
-            again = connect('/text', 'std_msgs/msg/String', callerid='/b')
-            distance = connect('/range', 'sensor_msgs/msg/Range')
+        clouds, odd = connect(topic, POINT_CLOUD2), connect('/odd', CUSTOM)
+        texts = [connect('/text', 'std_msgs/msg/String', callerid=name) for name in ('/a', '/b')]
         for k in range(n_clouds):
             time = START + k * PERIOD
             header, *body = vars(cloud(k)).values()
             stamp = time_type(header.stamp.sec, header.stamp.nanosec)
             header = new['std_msgs/msg/Header'](k, stamp, header.frame_id)
             clouds(time, header, *body)
-            if extras:
-                odd(time + 1, header, time_type(k, 5), np.arange(k, dtype=np.uint8), k / 3)
-                text(time + 2, f'{k} 2')
-                again(time + 3, f'{k} 3')
-                distance(time + 4, header, 1, 0.1, 0.2, 30.0, 1.0 + k)
+            odd(time + 1, header, time_type(k, 5), np.arange(k, dtype=np.uint8), k / 3)
+            for text in texts:
+                text(time + 2, f'{k}')

@@ -1,8 +1,7 @@
-"""Bags without reading them: paths, damaged files, topics, the wording of errors."""
+"""What is checked before a bag is read or written: its path, metadata.yaml, damaged files."""
 
 from __future__ import annotations
 
-import os
 import struct
 from collections import Counter
 from collections.abc import Iterator
@@ -21,7 +20,6 @@ BAG_SUFFIXES = ('.bag', *STORAGE_OF_SUFFIX)
 PACKED_SUFFIXES = ('.zstd', '.zst')
 
 _FOLDER_SUFFIXES = ('.mcap', '.db3', '.db3-shm', '.db3-wal', *PACKED_SUFFIXES)
-_MCAP_MAGIC = b'\x89MCAP0\r\n'
 # Part of an error of reading -> a hint at what to do.
 _NEXT_STEP = {
     'EndOfFile': 'damaged; `mcap recover` saves the readable part',
@@ -29,22 +27,6 @@ _NEXT_STEP = {
     'index looks damaged': 'truncated? `rosbag reindex` saves the readable part',
     'malformed': 'truncated or overwritten? `sqlite3 .recover` saves the readable part',
 }
-
-
-def is_bag(path: str | Path) -> bool:
-    """Whether `path` looks like a bag: a folder with metadata.yaml, or by its suffix."""
-    candidate = Path(path)
-    if candidate.is_dir():
-        return (candidate / METADATA_FILE).is_file()
-    return candidate.suffix in BAG_SUFFIXES
-
-
-def storage_of(path: Path) -> str:
-    """Storage of a bag: ``ros1``, ``mcap`` or ``sqlite3``."""
-    if path.suffix == '.bag' and not path.is_dir():
-        return 'ros1'
-    files = path.glob('*.db3*') if path.is_dir() else [path]
-    return 'sqlite3' if any('.db3' in file.suffixes for file in files) else 'mcap'
 
 
 def is_bag_folder(path: Path) -> bool:
@@ -59,11 +41,11 @@ def check_is_bag(path: Path) -> None:
     """Raise `DataError` with the next step if `path` cannot be a bag."""
     if not path.exists():
         raise DataError(f'{path}: no such file or folder')
-    if path.is_dir() and not is_bag(path):
+    if path.is_dir() and not (path / METADATA_FILE).is_file():
         files = sorted(child.name for child in path.iterdir() if child.suffix in BAG_SUFFIXES)
         hint = f'; bag files in it, to be given one by one: {", ".join(files)}' if files else ''
         raise DataError(f'{path}: not a rosbag2 folder (no {METADATA_FILE} in it){hint}')
-    if not is_bag(path):
+    if not path.is_dir() and path.suffix not in BAG_SUFFIXES:
         raise DataError(
             f'{path}: not a bag; accepted are ROS 1 .bag, .mcap, .db3 and rosbag2 folders'
         )
@@ -97,29 +79,6 @@ def list_files(path: Path) -> tuple[list[Path], dict[str, int], bool]:
     if wrong := [file.name for file in files if not {*file.suffixes} & {*STORAGE_OF_SUFFIX}]:
         raise DataError(f'{metadata}: {", ".join(wrong)}: accepted are .mcap and .db3')
     return files, counts, str(said.get('compression_mode')).lower() == 'message'
-
-
-def check_mcap_file(path: Path) -> None:
-    """Raise ValueError where an MCAP file has no end, or is of ROS 1."""
-    with path.open('rb') as file:
-        start = file.read(25)
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(size - len(_MCAP_MAGIC), 0))
-        end = file.read()
-    if not start.startswith(_MCAP_MAGIC):
-        raise ValueError('no MCAP' if start else 'empty')
-    if end != _MCAP_MAGIC or len(start) < 25:
-        raise ValueError(
-            'truncated, or still being recorded; `mcap recover` saves the readable part'
-        )
-    kind, n_bytes, _, profile = struct.unpack_from('<BQI4s', start, len(_MCAP_MAGIC))
-    if kind != 1 or n_bytes > size:
-        raise ValueError(f'its first record is of kind {kind} and {n_bytes} bytes, of {size}')
-    if profile == b'ros1':
-        raise ValueError(
-            'its profile is ros1; give the .bag that it was made from, or convert that by '
-            '`rosbags-convert --src IN.bag --dst OUT`'
-        )
 
 
 def check_sqlite_path(path: Path) -> None:

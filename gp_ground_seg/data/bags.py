@@ -25,22 +25,23 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError, PointCloudError, in_one_line, require
 from gp_ground_seg.data.bag_files import (
+    BAG_SUFFIXES,
     METADATA_FILE,
     PACKED_SUFFIXES,
     POINT_CLOUD2,
     STORAGE_OF_SUFFIX,
     SUFFIX_OF_STORAGE,
     check_is_bag,
-    check_mcap_file,
     check_sqlite_file,
     list_files,
     reading,
     resolve_storage,
-    storage_of,
 )
 from gp_ground_seg.data.clouds import check_numbers, gather
 from gp_ground_seg.data.files import staged_bag_folder, staged_file, writing
 from gp_ground_seg.data.point_cloud2 import DATATYPES, CloudMessage
+
+_MCAP_MAGIC = b'\x89MCAP0\r\n'
 
 
 @functools.cache
@@ -53,19 +54,24 @@ def jazzy_types() -> Any:
 
 
 class _Channel(NamedTuple):
-    """Messages of one topic, type and encoding in one file; `key` is its number there."""
+    """Messages of one topic, type and encoding in one file."""
 
-    key: int
     topic: str
     msgtype: str
     encoding: str
     n_messages: int
 
+    @property
+    def kind(self) -> str:
+        """Its type, with its encoding where that is not CDR."""
+        parts = (self.msgtype, self.encoding if self.encoding != 'cdr' else '')
+        return ', '.join(filter(None, parts))
 
-# Gives the key, recorded time [ns] and bytes of each message of the channels with these keys.
-_Read = Callable[[Collection[int]], Iterator[tuple[int, int, bytes]]]
-_Storage = tuple[list[_Channel], _Read]
-"""Of one file of a bag."""
+
+_Messages = Iterator[tuple[str, int, bytes]]
+"""Topic, recorded time [ns] and bytes of each."""
+_Storage = tuple[list[_Channel], Callable[[Collection[str]], _Messages]]
+"""Channels of one file of a bag, and what reads the CDR messages of some topics in it."""
 
 
 def _open_ros1(path: Path, stack: ExitStack) -> _Storage:
@@ -76,14 +82,16 @@ def _open_ros1(path: Path, stack: ExitStack) -> _Storage:
     bag.open()
     stack.callback(bag.close)
 
-    def read(keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        for connection, time, raw in bag.messages([c for c in bag.connections if c.id in keys]):
-            yield connection.id, time, jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2)
+    clouds = [c for c in bag.connections if c.msgtype == POINT_CLOUD2]
+
+    def read(topics: Collection[str]) -> _Messages:
+        for c, time, raw in bag.messages([c for c in clouds if c.topic in topics]):
+            yield c.topic, time, jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2)
 
     channels = []
     for c in bag.connections:
-        encoding = 'cdr' if c.msgtype == POINT_CLOUD2 else 'ros1'
-        channels.append(_Channel(c.id, c.topic, c.msgtype, encoding, c.msgcount))
+        encoding = 'cdr' if c in clouds else 'ros1'
+        channels.append(_Channel(c.topic, c.msgtype, encoding, c.msgcount))
     return channels, read
 
 
@@ -92,17 +100,19 @@ def _open_sqlite(path: Path, stack: ExitStack) -> _Storage:
     check_sqlite_file(path)
     address = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
     bag = stack.enter_context(closing(sqlite3.connect(address, uri=True, check_same_thread=False)))
-    counts = dict(bag.execute('SELECT topic_id, count(*) FROM messages GROUP BY topic_id'))
-    topics = bag.execute('SELECT id, name, type, serialization_format FROM topics')
-    channels = [
-        _Channel(n, topic, kind, form, counts.get(n, 0)) for n, topic, kind, form in topics
-    ]
+    rows = bag.execute(
+        'SELECT name, type, serialization_format, count(topic_id) FROM topics '
+        'LEFT JOIN messages ON topics.id = topic_id GROUP BY topics.id'
+    )
+    channels = [_Channel(*row) for row in rows]
 
-    def read(keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        wanted = ', '.join(str(int(key)) for key in keys)
+    def read(topics: Collection[str]) -> _Messages:
+        chosen = f"name IN ({', '.join('?' * len(topics))}) AND serialization_format = 'cdr'"
         yield from bag.execute(
-            'SELECT topic_id, timestamp, data FROM messages '
-            f'WHERE topic_id IN ({wanted}) ORDER BY timestamp'
+            'SELECT (SELECT name FROM topics WHERE topics.id = topic_id), timestamp, data '
+            f'FROM messages WHERE topic_id IN (SELECT id FROM topics WHERE {chosen}) '
+            'ORDER BY timestamp, id',
+            list(topics),
         )
 
     return channels, read
@@ -110,58 +120,57 @@ def _open_sqlite(path: Path, stack: ExitStack) -> _Storage:
 
 def _open_mcap(path: Path, stack: ExitStack) -> _Storage:
     """Open an ``.mcap``. Without an index of its chunks it is read in the order of the file."""
-    reader = require('mcap.reader', 'mcap')
-    check_mcap_file(path)
+    library = require('mcap.reader', 'mcap')
     file = stack.enter_context(path.open('rb'))
-    bag = reader.SeekingReader(file, validate_crcs=True)
+    if file.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
+        raise ValueError('no MCAP, or empty')
+    file.seek(-len(_MCAP_MAGIC), os.SEEK_END)
+    if file.read() != _MCAP_MAGIC:
+        raise ValueError(
+            'truncated, or still being recorded; `mcap recover` saves the readable part'
+        )
+    file.seek(0)
+    bag = library.SeekingReader(file, validate_crcs=True)
+    if bag.get_header().profile == 'ros1':
+        raise ValueError(
+            'its profile is ros1; give the .bag that it was made from, or convert that by '
+            '`rosbags-convert --src IN.bag --dst OUT`'
+        )
     summary = bag.get_summary()
     is_indexed = bool(summary and summary.chunk_indexes)
     counts = summary.statistics.channel_message_counts if summary and summary.statistics else {}
     channels, schemas = (summary.channels, summary.schemas) if summary else ({}, {})
     if not counts or not counts.keys() <= channels.keys():
-        counts = _scan_mcap(file, channels, schemas)
+        counts = Counter()
+        file.seek(0)
+        every = library.NonSeekingReader(file).iter_messages(log_time_order=False)
+        for schema, channel, _ in every:
+            counts[channel.id] += 1
+            channels[channel.id], schemas[channel.schema_id] = channel, schema
 
-    def read(keys: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        topics = {channels[key].topic for key in keys}
+    def read(topics: Collection[str]) -> _Messages:
         for _, channel, message in bag.iter_messages(topics, log_time_order=is_indexed):
-            if channel.id in keys:
-                yield channel.id, message.log_time, message.data
+            if channel.message_encoding == 'cdr':
+                yield channel.topic, message.log_time, message.data
 
     found = []
     for c in channels.values():
         msgtype = schemas[c.schema_id].name if c.schema_id else ''
-        found.append(_Channel(c.id, c.topic, msgtype, c.message_encoding, counts.get(c.id, 0)))
+        found.append(_Channel(c.topic, msgtype, c.message_encoding, counts.get(c.id, 0)))
     return found, read
 
 
-def _scan_mcap(file: Any, channels: dict[int, Any], schemas: dict[int, Any]) -> Counter[int]:
-    """Count the messages of each channel, and complete those of the summary."""
-    from mcap.records import Channel, Message, Schema
-    from mcap.stream_reader import StreamReader
-
-    counts: Counter[int] = Counter()
-    file.seek(0)
-    for record in StreamReader(file, validate_crcs=True).records:
-        if isinstance(record, Message):
-            counts[record.channel_id] += 1
-        elif isinstance(record, Channel):
-            channels[record.id] = record
-        elif isinstance(record, Schema):
-            schemas[record.id] = record
-    return counts
+_OPENERS = {'ros1': _open_ros1, 'sqlite3': _open_sqlite, 'mcap': _open_mcap}
 
 
-_OPENERS = {'.bag': _open_ros1, '.db3': _open_sqlite, '.mcap': _open_mcap}
-
-
-def _open_storage(file: Path, stack: ExitStack) -> _Storage:
+def _open_storage(file: Path, storage: str, stack: ExitStack) -> _Storage:
     """Open one file of a bag; a packed one is unpacked first."""
     if file.suffix in PACKED_SUFFIXES:
         plain = Path(stack.enter_context(tempfile.TemporaryDirectory()), file.stem)
         with file.open('rb') as source, plain.open('wb') as target:
             require('zstandard', 'mcap').ZstdDecompressor().copy_stream(source, target)
         file = plain
-    return _OPENERS[file.suffix](file, stack)
+    return _OPENERS[storage](file, stack)
 
 
 class BagReader(AbstractContextManager['BagReader']):
@@ -175,20 +184,21 @@ class BagReader(AbstractContextManager['BagReader']):
     def __init__(self, path: str | Path) -> None:
         require('rosbags.highlevel', 'rosbags mcap')
         self.path = Path(path)
-        self.storage = storage_of(self.path)  # ``ros1``, ``mcap`` or ``sqlite3``
         with ExitStack() as stack:
             with reading(self.path):
                 check_is_bag(self.path)
                 files, self._counts, self._is_packed = list_files(self.path)
-                self._storages = [_open_storage(file, stack) for file in files]
+                suffix = next(word for word in files[0].suffixes[::-1] if word in BAG_SUFFIXES)
+                self.storage = STORAGE_OF_SUFFIX.get(suffix, 'ros1')
+                self._storages = [_open_storage(file, self.storage, stack) for file in files]
             self._open = stack.pop_all()
-        self._topics: dict[str, list[_Channel]] = {}
-        found = [channel for channels, _ in self._storages for channel in channels]
-        # What is recorded on a topic beside CDR is left.
-        for channel in sorted(found, key=_is_foreign):
-            known = self._topics.setdefault(channel.topic, [])
-            if not known or channel.encoding == known[0].encoding:
-                known.append(channel)
+        self._channels: dict[str, list[_Channel]] = {}
+        for channels, _ in self._storages:
+            for channel in channels:
+                self._channels.setdefault(channel.topic, []).append(channel)
+        # Messages that are not CDR are skipped on a topic that has others.
+        for name, channels in self._channels.items():
+            self._channels[name] = [c for c in channels if c.encoding == 'cdr'] or channels
 
     def __exit__(self, *error: object) -> None:
         """Close the files; nothing can be read afterwards."""
@@ -197,22 +207,24 @@ class BagReader(AbstractContextManager['BagReader']):
     @property
     def topics(self) -> dict[str, str]:
         """Type of the messages of each topic; those not in CDR with their encoding."""
-        return {name: self._kind(name) for name in self._topics}
-
-    def _kind(self, topic: str) -> str:
-        channels = self._topics[topic]
-        types = ' and '.join(sorted({channel.msgtype for channel in channels}))
-        encoding = channels[0].encoding
-        return types if encoding == 'cdr' else ', '.join(filter(None, (types, encoding)))
+        return {
+            name: ' and '.join(sorted({channel.kind for channel in channels}))
+            for name, channels in self._channels.items()
+        }
 
     def _list_topics(self) -> str:
         return ', '.join(f'{name} ({kind})' for name, kind in self.topics.items()) or 'none'
 
+    def _is_readable(self, topic: str) -> bool:
+        """Whether the messages of a topic are of one type in CDR."""
+        channels = self._channels[topic]
+        return channels[0].encoding == 'cdr' and len({c.msgtype for c in channels}) == 1
+
     def n_messages(self, topic: str) -> int:
         """Messages of one topic; raises DataError if there is none of that name."""
-        if topic not in self._topics:
+        if topic not in self._channels:
             raise DataError(f'{self.path}: no topic {topic}; topics here: {self._list_topics()}')
-        return self._counts.get(topic, sum(c.n_messages for c in self._topics[topic]))
+        return self._counts.get(topic, sum(c.n_messages for c in self._channels[topic]))
 
     def pick_point_cloud_topic(self, topic: str | None = None) -> str:
         """Return `topic` if it has point clouds, or the only one that has; else a DataError."""
@@ -221,7 +233,7 @@ class BagReader(AbstractContextManager['BagReader']):
             self.n_messages(topic)
             if topic not in clouds:
                 raise DataError(
-                    f'{self.path}: topic {topic} is of type {self._kind(topic)}, must be '
+                    f'{self.path}: topic {topic} is of type {self.topics[topic]}, must be '
                     f'{POINT_CLOUD2}; such topics here: {", ".join(clouds) or "none"}'
                 )
             clouds = [topic]
@@ -237,28 +249,26 @@ class BagReader(AbstractContextManager['BagReader']):
             problem = f'no {POINT_CLOUD2} topic; topics here: {self._list_topics()}'
         raise DataError(f'{self.path}: {problem}')
 
-    def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, bytes]]:
+    def messages(self, topics: Collection[str] | None = None) -> _Messages:
         """Topic, recorded time [ns] and CDR bytes of each message, by default of all in CDR.
 
         In order of their time; file after file in a split bag. Raises DataError if a topic is
         unknown, of several types or not in CDR, the bag damaged, or its list of messages wrong.
         """
         if topics is None:
-            topics = [name for name in self._topics if _is_readable(self._topics[name])]
+            topics = [name for name in self._channels if self._is_readable(name)]
         expected = {name: self.n_messages(name) for name in topics}
         for name in expected:
-            if not _is_readable(self._topics[name]):
+            if not self._is_readable(name):
                 raise DataError(
-                    f'{self.path}: topic {name} has messages of {self._kind(name)}; '
+                    f'{self.path}: topic {name} has messages of {self.topics[name]}; '
                     'one topic must have one type, and be in CDR'
                 )
         found: Counter[str] = Counter()
-        for channels, read in self._storages:
-            wanted = [c for c in channels if c.topic in expected and not _is_foreign(c)]
-            names = {channel.key: channel.topic for channel in wanted}
-            for key, time, raw in self._read(read(names)) if names else ():
-                found[names[key]] += 1
-                yield names[key], time, raw
+        for _, read in self._storages:
+            for name, time, raw in self._read(read(expected)) if expected else ():
+                found[name] += 1
+                yield name, time, raw
         for name, n_messages in expected.items():
             if found[name] != n_messages:
                 raise DataError(
@@ -267,27 +277,18 @@ class BagReader(AbstractContextManager['BagReader']):
                     f'or its {METADATA_FILE} belongs to another one'
                 )
 
-    def _read(self, source: Iterator[tuple[int, int, bytes]]) -> Iterator[tuple[int, int, bytes]]:
+    def _read(self, source: _Messages) -> _Messages:
         """Messages of one file, unpacked; what goes wrong is a DataError."""
         while True:
             # Errors of the caller, raised at the yield, must not pass through here.
             with reading(self.path):
-                if (entry := next(source, None)) is None:
+                if (message := next(source, None)) is None:
                     return
-                key, time, raw = entry
+                name, time, raw = message
                 if self._is_packed:
                     unpacker = require('zstandard', 'mcap').ZstdDecompressor()
                     raw = unpacker.decompressobj().decompress(raw)
-            yield key, time, bytes(raw)
-
-
-def _is_foreign(channel: _Channel) -> bool:
-    return channel.encoding != 'cdr'
-
-
-def _is_readable(channels: list[_Channel]) -> bool:
-    """Whether the messages of a topic are of one type in CDR."""
-    return len({c.msgtype for c in channels}) == 1 and not _is_foreign(channels[0])
+            yield name, time, bytes(raw)
 
 
 class BagWriter:

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import io
 import textwrap
-import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -43,12 +42,12 @@ if TYPE_CHECKING:
 NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
 KITTI_COLUMNS = 4
 MIN_COLUMNS = 3
-_OTHER_COLUMNS = range(MIN_COLUMNS, 9)  # that are looked at in doubt
+_OTHER_COLUMNS = range(MIN_COLUMNS, 9)  # that are tried
 
 _MIN_POINTS = 100  # fewer are not judged
-_N_JUDGED = 10_000  # points looked at in a larger scan
-_N_DISTANCES = 2_000  # of successive points, that are looked at
-_SMALLEST = 1e-6  # of a coordinate that can be measured [m]
+_N_JUDGED = 10_000  # points of a larger scan that are judged
+_N_DISTANCES = 2_000  # between successive points, of a larger scan
+_SMALLEST = 1e-6  # coordinate that can be measured [m]
 _MAX_UNMEASURABLE = 0.4  # share of them; z may be zero in a whole scan
 # Three quarters of the points of the other number are that much nearer to the next one than the
 # median of the given number. Beams that fire in turns are far from each other, and every second
@@ -59,29 +58,26 @@ TABLE = 'points'  # array of an .npz that is a table (N, >= 3), beside fields (N
 
 
 def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
-    """Read a table x, y, z, intensity, ..., a structured array, or arrays by name."""
+    """Read a table x, y, z, intensity, ..., a structured array, or arrays by name.
+
+    Arrays of another length than that of the points are what the file has beside them.
+    """
     found = np.load(io.BytesIO(data), allow_pickle=False)
-    if isinstance(found, np.ndarray):
-        return _fields_of({TABLE: found})
-    return _fields_of(dict(found))
-
-
-def _fields_of(arrays: Columns) -> tuple[Fields, Columns]:
-    """Put the fields and the table together; arrays of another length are what is beside them."""
+    arrays: Columns = {TABLE: found} if isinstance(found, np.ndarray) else dict(found)
     table = arrays.pop(_table_name(arrays), None)
-    if table is not None and table.dtype.names is None:
-        if table.ndim != 2 or table.shape[1] < 3:
-            raise PointCloudError(f'array of shape {table.shape}: must be (N, 3) or wider')
-        if table.shape[0] in (3, 4) and table.shape[1] >= _TRANSPOSED:
-            raise PointCloudError(f'array of shape {table.shape}: is transposed; save its .T')
-        table = name_columns(table)
-    columns = {**({} if table is None else scatter(table.ravel())), **arrays}
-    x = coordinate_names(columns)[0]
-    shape = columns[x].shape if x in columns else ()
-    fields = {name: v for name, v in columns.items() if shape and v.shape[:1] == shape}
+    if table is not None:
+        if table.dtype.names is None:
+            if table.ndim != 2 or table.shape[1] < 3:
+                raise PointCloudError(f'array of shape {table.shape}: must be (N, 3) or wider')
+            if table.shape[0] in (3, 4) and table.shape[1] >= _TRANSPOSED:
+                raise PointCloudError(f'array of shape {table.shape}: is transposed; save its .T')
+            table = name_columns(table)
+        arrays = {**scatter(table.ravel()), **arrays}
+    x = arrays.get(coordinate_names(arrays)[0], np.empty(()))
+    fields = {name: v for name, v in arrays.items() if x.ndim and v.shape[:1] == x.shape}
     if not fields:
-        raise PointCloudError(f'no field x of one number per point; fields: {_shapes(columns)}')
-    return gather(fields), {name: v for name, v in columns.items() if name not in fields}
+        raise PointCloudError(f'no field x of one number per point; fields: {_shapes(arrays)}')
+    return gather(fields), {name: v for name, v in arrays.items() if name not in fields}
 
 
 def _shapes(arrays: Columns) -> str:
@@ -106,29 +102,19 @@ def _table_name(arrays: Columns) -> str:
 def _encode_npy(cloud: Cloud) -> bytes:
     """File of a structured array."""
     file = io.BytesIO()
-    _write_array(file, cloud.fields)
+    is_ascii = ''.join(cloud.fields.dtype.names or ()).isascii()
+    # Without numpy's warning that names beyond ASCII need numpy 1.17.
+    version = None if is_ascii else (3, 0)
+    np.lib.format.write_array(file, cloud.fields, version, allow_pickle=False)
     return file.getvalue()
-
-
-def _write_array(file: IO[bytes], values: npt.NDArray[Any]) -> None:
-    """Write an ``.npy``, without numpy's warning that names beyond ASCII need numpy 1.17."""
-    is_ascii = ''.join(values.dtype.names or ()).isascii()
-    np.lib.format.write_array(file, values, None if is_ascii else (3, 0), allow_pickle=False)
 
 
 def _encode_npz(cloud: Cloud) -> bytes:
     """File of an array for each field, and of arrays of another length."""
-    others = cloud.header if isinstance(cloud.header, dict) else {}
-    return encode_arrays({**others, **scatter(cloud.fields)})
-
-
-def encode_arrays(arrays: Columns) -> bytes:
-    """File .npz of arrays by name; `numpy.savez` takes some names for its own arguments."""
     file = io.BytesIO()
-    with zipfile.ZipFile(file, 'w', zipfile.ZIP_DEFLATED) as archive:
-        for name, values in arrays.items():
-            with archive.open(f'{name}.npy', 'w', force_zip64=True) as member:
-                _write_array(member, np.asarray(values))
+    others = cloud.header if isinstance(cloud.header, dict) else {}
+    arrays: dict[str, Any] = {**others, **scatter(cloud.fields)}
+    np.savez(file, **arrays)
     return file.getvalue()
 
 
@@ -243,7 +229,7 @@ def read_scan(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[np.
 
 
 def find_columns(numbers: npt.NDArray[np.float32], columns: int) -> int:
-    """Return the number of columns with which this is a scan of much nearer points; 0 if none."""
+    """Return the number of columns with which successive points are much nearer; 0 if none."""
     if len(numbers) < _MIN_POINTS * columns:
         return 0
     fitting = [n for n in _OTHER_COLUMNS if len(numbers) % n == 0 and columns % n and n % columns]
@@ -256,7 +242,7 @@ def find_columns(numbers: npt.NDArray[np.float32], columns: int) -> int:
 
 
 def _distance(numbers: npt.NDArray[np.float32], columns: int, share: float) -> float:
-    """Distance [m] that this share of successive finite points is not beyond; or infinity."""
+    """Quantile `share` of the distances [m] of successive finite points; infinity without."""
     xyz = numbers.reshape(-1, columns)[:, :3]
     first = np.arange(0, len(xyz) - 1, 1 + len(xyz) // _N_DISTANCES)
     with np.errstate(all='ignore'):

@@ -21,12 +21,12 @@ Columns = dict[str, npt.NDArray[Any]]
 COLUMNS = ('x', 'y', 'z', 'intensity')
 """Names of the first columns of a table without names; the others are column_5, ..."""
 MAX_NUMBERS = 1000
-"""Numbers of a point that are accepted: a header can name more where there is no point."""
+"""Most numbers of a point: the header of a file without points can name any number."""
 _MAX_HEADER_BYTES = 1 << 16
 _COORDINATES = frozenset('xyzXYZ')
 _LONG = {'i8', 'u8'}
 _NO_NUMBER = re.compile(rb'[-+]?(nan\(\w+\)|1\.#(QNAN|SNAN|IND)\w*)', re.IGNORECASE)
-"""As Windows writes it."""
+"""NaN as programs on Windows write it."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Cloud:
         Points for `GroundSegmenter.segment`: x, y, z [m], the sensor at the origin; of a ``.bin``
         scan (N, 4), with the intensity.
     header : opaque
-        Contents of the file beside the points, with which it is written again; None without.
+        What the file has besides its points, and gets again when it is written; or None.
     """
 
     fields: Fields
@@ -65,19 +65,20 @@ def coordinate_names(names: Collection[str]) -> list[str]:
 
 @functools.cache
 def note(text: str) -> None:
-    """Log it once, however many files it concerns."""
+    """Log a text once, however many files it is about."""
     LOGGER.info(text)
 
 
 def cloud_of(fields: Fields, header: Any = None) -> Cloud:
     """Cloud of the points of a structured array; PointCloudError without numbers x, y, z."""
-    names = coordinate_names(fields.dtype.names or ())
+    known = fields.dtype.names or ()
+    names = coordinate_names(known)
     for name in names:
-        dtype = dict(fields.dtype.fields or {}).get(name, [np.dtype('V')])[0]
-        if dtype.kind not in 'fiu':
-            known = ', '.join(fields.dtype.names or ()) or 'none'
-            wanted = name.lower()
-            raise PointCloudError(f'no field {wanted} of one number per point; fields: {known}')
+        if name not in known or fields.dtype[name].kind not in 'fiu':
+            found = ', '.join(known) or 'none'
+            raise PointCloudError(
+                f'no field {name.lower()} of one number per point; fields: {found}'
+            )
     columns = [fields[name] for name in names]
     is_single = all(column.dtype.kind == 'f' and column.itemsize <= 4 for column in columns)
     # A sensor's bytes may be a signalling NaN.
@@ -120,20 +121,16 @@ def count_numbers(dtype: np.dtype[Any]) -> int:
     return sum(math.prod(dtype[name].shape) for name in dtype.names or ())
 
 
-def distinct(names: Sequence[str], originals: Sequence[str] | None = None) -> list[str]:
+def distinct(names: Sequence[str]) -> list[str]:
     """Return `names`, where one that is there already gets ``_2``, ``_3``, ... behind it.
 
-    A name that is equal to that of `originals` in its place goes before others. PointCloudError
-    for more than `MAX_NUMBERS`.
+    PointCloudError for more than `MAX_NUMBERS`.
     """
     check_numbers(len(names))
-    pairs = list(zip(names, originals or names, strict=True))
-    first = {name for name, original in pairs if name == original}
     found: dict[str, None] = {}
-    for name, original in pairs:
+    for name in names:
         options = (name if k == 1 else f'{name}_{k}' for k in count(1))
-        free = (o for o in options if o not in found and (o == original or o not in first))
-        found[next(free)] = None
+        found[next(option for option in options if option not in found)] = None
     return list(found)
 
 
@@ -146,7 +143,6 @@ def in_types(
     it holds them exactly; where `flat`, a field ``a`` of several numbers becomes fields ``a_0``,
     ``a_1``, ... Names stay `distinct`. Raises PointCloudError for a type that is not `accepted`.
     """
-    originals: list[str] = []
     names: list[str] = []
     columns: list[npt.NDArray[Any]] = []
     for name, values in scatter(fields).items():
@@ -159,37 +155,29 @@ def in_types(
         values = values.astype(f'<{code}')
         word = '_'.join(name.split())
         word = 'field' if word in ('', '_') else word  # _ is the padding of a PCD
-        parts = {word: values}
         if flat and values.ndim > 1:
             table = values.reshape(len(values), math.prod(values.shape[1:]))
-            parts = {f'{word}_{k}': table[:, k] for k in range(table.shape[1])}
-        originals += [name] * len(parts)
-        names += parts
-        columns += parts.values()
-    return gather(dict(zip(distinct(names, originals), columns, strict=True)))
+            names += [f'{word}_{k}' for k in range(table.shape[1])]
+            columns += list(table.T)
+        else:
+            names.append(word)
+            columns.append(values)
+    return gather(dict(zip(distinct(names), columns, strict=True)))
 
 
 def split_header(data: bytes, last: str) -> tuple[list[str], bytes]:
-    """Lines of a header, with the `last`, known by its first word, and the bytes behind it.
-
-    As the first line ends, so do the others: with a line feed, or a carriage return alone.
-    """
+    """Lines of a header, with the `last`, known by its first word, and the bytes behind it."""
     head = data[:_MAX_HEADER_BYTES]
-    first = re.search(rb'\r?\n|\r', head)
-    end = r'\r' if first and first[0] == b'\r' else r'\r?\n'
-    line = rf'(?<![^\r\n]){last}\b[^\r\n]*{end}'.encode()
-    found = re.search(line, head, re.IGNORECASE)
+    found = re.search(rf'^{last}\b.*\n'.encode(), head, re.IGNORECASE | re.MULTILINE)
     if found is None:
         raise PointCloudError(f'no {last} line of a header in it')
-    try:
-        text = head[: found.end()].decode('utf-8-sig')
-    except UnicodeDecodeError:
-        text = head[: found.end()].decode('latin-1')
-    return [line for line in re.split('[\r\n]+', text) if line.strip()], data[found.end() :]
+    text = head[: found.end()].decode('utf-8-sig', errors='backslashreplace')
+    lines = [line.strip() for line in text.split('\n')]
+    return [line for line in lines if line], data[found.end() :]
 
 
 def check_size(n_bytes: int, n_points: int, needed: int) -> None:
-    """Raise PointCloudError if so many points of `needed` bytes are not in the file."""
+    """Raise PointCloudError if the points need more bytes than are there."""
     if needed > n_bytes:
         raise PointCloudError(
             f'{n_bytes} bytes behind the header, which says {n_points} points '
@@ -203,50 +191,40 @@ def read_table(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
     return np.frombuffer(data, dtype, n_points)
 
 
-def lines_of(data: bytes) -> list[bytes]:
-    """Lines of a text, without empty ones."""
-    return [line for line in data.splitlines() if line.strip()]
-
-
-def read_lines(lines: Sequence[bytes], dtype: np.dtype[Any], n_points: int) -> Fields:
+def read_lines(text: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
     """Read points of a text, one a line; PointCloudError if there are fewer than it should have.
 
-    An integer field that has other numbers becomes float64. A field beside x, y and z that has no
-    numbers is left out.
+    Further words of a line are left out. An integer field that has other numbers becomes float64.
+    A field beside x, y and z that has no numbers is left out.
     """
+    lines = [line for line in text.splitlines() if line.strip()][:n_points]
     if len(lines) < n_points:
         raise PointCloudError(f'{len(lines)} points, its header says {n_points}; truncated?')
-    check_numbers(count_numbers(dtype))
+    wanted = count_numbers(dtype)
+    check_numbers(wanted)
     if n_points == 0:
         return np.empty(0, dtype)
-    try:
-        return np.loadtxt(lines[:n_points], dtype, comments=None, ndmin=1)
-    except (ValueError, TypeError):
-        lines = [_NO_NUMBER.sub(b'nan', line) for line in lines[:n_points]]
-        n_words, wanted = min(len(line.split()) for line in lines), count_numbers(dtype)
-        if n_words < wanted:
-            words = f'a line of {n_words} words, its header says {wanted}, separated by spaces'
-            raise PointCloudError(words) from None
-    columns, stop = {}, 0
+    with suppress(ValueError, TypeError):
+        return np.loadtxt(lines, dtype, comments=None, ndmin=1, usecols=range(wanted))
+    lines = [_NO_NUMBER.sub(b'nan', line) for line in lines]
+    if (n_words := min(len(line.split()) for line in lines)) < wanted:
+        raise PointCloudError(
+            f'a line of {n_words} words, its header says {wanted}, separated by spaces'
+        )
+    columns: Columns = {}
+    stop = 0
     for name in dtype.names or ():
-        start, stop = stop, stop + math.prod(dtype[name].shape)
-        values = _read_column(lines, name, dtype[name].base, range(start, stop))
-        if values is not None:
-            columns[name] = values.reshape(-1, *dtype[name].shape)
+        own, shape = dtype[name].base, dtype[name].shape
+        start, stop = stop, stop + math.prod(shape)
+        for kind in (own, np.dtype('f8')):
+            with suppress(ValueError, TypeError):
+                values = np.loadtxt(lines, kind, None, usecols=range(start, stop), ndmin=2)
+                columns[name] = values.reshape(-1, *shape)
+                break
+        if name not in columns:
+            if name in _COORDINATES:
+                raise PointCloudError(f'field {name}: has what is no number')
+            note(f'field {name}: has what is no number; left out')
+        elif columns[name].dtype != own:
+            note(f'field {name}: has numbers that are no {own}; read as float64')
     return gather(columns)
-
-
-def _read_column(
-    lines: Sequence[bytes], name: str, dtype: np.dtype[Any], used: range
-) -> npt.NDArray[Any] | None:
-    """Numbers of a field, (N, M), float64 if they are no such integers; None if no numbers."""
-    for kind in (dtype, np.dtype('f8')) if dtype.kind in 'iu' else (dtype,):
-        with suppress(ValueError, TypeError):
-            values = np.loadtxt(lines, kind, comments=None, usecols=used, ndmin=2)
-            if kind != dtype:
-                note(f'field {name}: has numbers that are no {dtype}; read as float64')
-            return values
-    if name in _COORDINATES:
-        raise PointCloudError(f'field {name}: has what is no number')
-    note(f'field {name}: has what is no number; left out')
-    return None

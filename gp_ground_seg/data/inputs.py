@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gp_ground_seg.core.errors import LOGGER, DataError, PointCloudError, shown
 from gp_ground_seg.core.pipeline.points import take_points
-from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
+from gp_ground_seg.data.bag_files import BAG_SUFFIXES, METADATA_FILE
 from gp_ground_seg.data.bags import BagReader, decode_cloud
 from gp_ground_seg.data.cloud_files import (
     FROM_TEXT,
@@ -61,20 +61,16 @@ class Inputs:
     """
 
     def __init__(
-        self,
-        path: Path,
-        items: Sequence[Input],
-        topic: str | None = None,
-        n_messages: int = 0,
+        self, path: Path, items: Sequence[Input], topic: str | None = None, n_messages: int = 0
     ) -> None:
         self.path = path
         self.topic = topic  # of a bag, else None
         self._items = items
-        self._length = n_messages or len(items)
+        self._n_messages = n_messages
 
     def __len__(self) -> int:
         """Count the clouds."""
-        return self._length
+        return self._n_messages or len(self._items)
 
     def __iter__(self) -> Iterator[Input]:
         """Yield each cloud, not read yet."""
@@ -119,20 +115,22 @@ def list_inputs(
     if topic is not None:
         raise DataError(f'--topic: is for bags, which {source} is not')
     files = _find_files(path)
-    stems = [_stem(file) for file in files]
-    clashing = {stem for stem, n in Counter(stems).items() if n > 1}
-    names = [f.name if stem in clashing else stem for f, stem in zip(files, stems, strict=True)]
-    pairs = zip(names, files, strict=True)
-    items = [Input(n, shown(f.name), f, partial(read_file, f, columns)) for n, f in pairs]
+    stems = Counter(map(_stem, files))
+    items = []
+    for file in files:
+        name = _stem(file) if stems[_stem(file)] == 1 else file.name
+        items.append(Input(name, shown(file.name), file, partial(read_file, file, columns)))
     return Inputs(path, items)
 
 
 def holds_bag(path: Path) -> bool:
     """Whether `path` is a bag, or a folder that has bag files and no scans in it."""
-    if path.is_dir() and not any(map(_is_scan, path.iterdir())):
-        # `BagReader` says what is missing there.
-        return is_bag(path) or any(child.suffix in BAG_SUFFIXES for child in path.iterdir())
-    return is_bag(path)
+    if not path.is_dir():
+        return path.suffix in BAG_SUFFIXES
+    children = list(path.iterdir())
+    has_bags = any(child.suffix in BAG_SUFFIXES for child in children)
+    # Of bag files without metadata `BagReader` says what is missing.
+    return (path / METADATA_FILE).is_file() or (has_bags and not any(map(_is_scan, children)))
 
 
 def _is_scan(path: Path) -> bool:
@@ -170,20 +168,16 @@ def _find_files(source: Path) -> Sequence[Path]:
 def _without_output(files: Sequence[Path]) -> Sequence[Path]:
     """Leave out files that are named as the output of another one."""
     stems = {_stem(file) for file in files}
-    kept = [file for file in files if not _is_output(_stem(file), stems)]
+    sources = {stem: _OUTPUT.sub('', stem) for stem in stems}
+    outputs = {stem for stem, source in sources.items() if source != stem and source in stems}
+    kept = [file for file in files if _stem(file) not in outputs]
     if n_left_out := len(files) - len(kept):
         LOGGER.info('output of earlier runs left out: %d of %d files', n_left_out, len(files))
     return kept
 
 
-def _is_output(stem: str, stems: Set[str]) -> bool:
-    source = _OUTPUT.sub('', stem)
-    return source != stem and source in stems
-
-
 def _stem(path: Path) -> str:
-    name = path.name
-    return name.removesuffix(NUSCENES_SUFFIX) if name.endswith(NUSCENES_SUFFIX) else path.stem
+    return path.stem.removesuffix('.pcd') if path.name.endswith(NUSCENES_SUFFIX) else path.stem
 
 
 def _decode(raw: bytes, place: str) -> Cloud:

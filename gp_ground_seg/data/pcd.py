@@ -23,8 +23,6 @@ from gp_ground_seg.data.clouds import (
     distinct,
     gather,
     in_types,
-    lines_of,
-    note,
     read_lines,
     read_table,
     split_header,
@@ -32,12 +30,14 @@ from gp_ground_seg.data.clouds import (
 
 _MAX_EXPANSION = 88  # of LZF: three bytes repeat 264 at most
 _MAX_BYTES = 1 << 16  # of a point
+_MAX_NUMBER = 1 << 32  # in a header
+_PADDING = ' '  # no name of a header has a space
 _SHAPE = ('WIDTH', 'HEIGHT', 'POINTS')
 _TYPES = {f'{kind}{n}' for kind in 'iu' for n in (1, 2, 4, 8)} | {'f4', 'f8'}
 
 
 class PcdHeader(NamedTuple):
-    """Entries of a header that are kept beside the points."""
+    """Entries of a header that are written again."""
 
     width: int = 0
     height: int = 1
@@ -59,15 +59,15 @@ def read_pcd(data: bytes) -> tuple[Fields, PcdHeader]:
     types = _types_of(names, entries)
     form = ' '.join(entries.get('DATA', ())).lower()
     if form == 'binary_compressed':
-        packed = np.dtype([entry for entry in types if not entry[0].startswith('_ ')])
+        packed = np.dtype([entry for entry in types if _PADDING not in entry[0]])
         fields = _read_compressed(rest, packed, width * height)
     elif form == 'ascii':
-        fields = read_lines(lines_of(rest), np.dtype(types), width * height)
+        fields = read_lines(rest, np.dtype(types), width * height)
     elif form == 'binary':
         fields = read_table(rest, np.dtype(types), width * height)
     else:
         raise PointCloudError(f'DATA {form}: must be ascii, binary or binary_compressed')
-    kept = [name for name in fields.dtype.names or () if ' ' not in name]
+    kept = [name for name in fields.dtype.names or () if _PADDING not in name]
     viewpoint = ' '.join(entries.get('VIEWPOINT', PcdHeader().viewpoint.split()))
     return gather({name: fields[name] for name in kept}), PcdHeader(width, height, viewpoint)
 
@@ -85,15 +85,15 @@ def _shape_of(entries: dict[str, list[str]]) -> tuple[int, int]:
     return width, height
 
 
-def _number(key: str, word: str, most: int = 1 << 32) -> int:
-    """Whole number of a header; PointCloudError if it is none, or larger than `most`."""
-    if not (word.isdecimal() and len(word) < 12 and int(word) <= most):
-        raise PointCloudError(f'{key} {word}: must be a whole number, at most {most}')
+def _number(key: str, word: str) -> int:
+    """Whole number of a header; PointCloudError if it is none, or larger than `_MAX_NUMBER`."""
+    if not (word.isdecimal() and len(word) < 12 and int(word) <= _MAX_NUMBER):
+        raise PointCloudError(f'{key} {word}: must be a whole number, at most {_MAX_NUMBER}')
     return int(word)
 
 
 def _types_of(names: list[str], entries: dict[str, list[str]]) -> list[tuple[str, str, Any]]:
-    """Name, type and shape of each field; what is left out has a space in its name."""
+    """Name, type and shape of each field; `_PADDING` is in the name of what is left out."""
     types: list[tuple[str, str, Any]] = []
     defaults = {'TYPE': 'F', 'SIZE': '4', 'COUNT': '1'}
     columns = [entries.get(key, [word] * len(names)) for key, word in defaults.items()]
@@ -101,18 +101,12 @@ def _types_of(names: list[str], entries: dict[str, list[str]]) -> list[tuple[str
         pairs = zip(defaults, columns, strict=True)
         counts = ', '.join(f'{len(column)} {key}' for key, column in pairs)
         raise PointCloudError(f'{len(names)} FIELDS, but {counts}; spaces in a name?')
-    for name, kind, size, count in zip(distinct(names), *columns, strict=True):
+    for given, name, kind, size, count in zip(names, distinct(names), *columns, strict=True):
         code, shape = f'{kind.lower()}{size}', () if count == '1' else (_number('COUNT', count),)
-        if names[len(types)] == '_':
-            name = f'_ {len(types)}'
-        elif code not in _TYPES and name.lower() in ('x', 'y', 'z'):
+        if code not in _TYPES:
             raise PointCloudError(f'field {name}: no type {kind} of {size} bytes')
-        elif code not in _TYPES:
-            code = f'V{_number("SIZE", size, _MAX_BYTES)}'
-            note(f'field {name}: no type {kind} of {size} bytes; left out')
-            name += ' '
-        types.append((name, f'<{code}', shape))
-    check_numbers(sum(math.prod(shape) for name, _, shape in types if name[:2] != '_ '))
+        types.append((f'{_PADDING}{name}' if given == '_' else name, f'<{code}', shape))
+    check_numbers(sum(math.prod(shape) for name, _, shape in types if _PADDING not in name))
     # numpy adds them in 32 bits, and would read outside of the file.
     n_bytes = sum(np.dtype(code).itemsize * math.prod(shape) for _, code, shape in types)
     if n_bytes > _MAX_BYTES:
@@ -131,12 +125,12 @@ def _read_compressed(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields
         raise PointCloudError(f'{len(body)} packed bytes cannot hold the {size} of its header')
     # LZF knows no empty text.
     body = require('lzf', 'python-neo-lzf').decompress(body, size) if size else b''
-    columns, start = {}, 0
+    fields, start = np.empty(n_points, dtype), 0
     for name in dtype.names or ():
         column = np.frombuffer(body, np.dtype([(name, dtype[name])]), n_points, start)
-        columns[name] = column[name]
+        fields[name] = column[name]
         start += column.nbytes
-    return gather(columns)
+    return fields
 
 
 def encode_pcd(cloud: Cloud) -> bytes:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from numpy.lib.recfunctions import repack_fields
 from numpy.lib.stride_tricks import as_strided
 
-from gp_ground_seg.core.errors import PointCloudError, in_one_line
+from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.pipeline.points import finite_points, single_precision
 from gp_ground_seg.data.clouds import distinct
 
@@ -89,20 +89,19 @@ def read_fields(cloud: CloudMessage) -> npt.NDArray[np.void]:
     A field of several numbers is a sub-array. Raises PointCloudError as `read_xyz`, and if any
     field cannot be as it is described.
     """
-    names = distinct([field.name for field in cloud.fields])
-    layout: Any = {'names': names, 'formats': [], 'offsets': [], 'itemsize': cloud.point_step}
-    try:
-        for field in cloud.fields:
-            # Some old writers leave count at 0 and mean 1.
-            shape = () if field.count < 2 else (field.count,)
-            layout['formats'].append((_code(cloud, field.datatype), shape))
-            layout['offsets'].append(field.offset)
-            # numpy adds in 32 bits, and would read outside of the data.
-            if problem := _find_problem_of_place(field, cloud.point_step):
-                raise ValueError(f'{field.name} {problem}')
-        dtype = np.dtype(layout)
-    except (KeyError, ValueError) as error:
-        raise PointCloudError(f'point cloud: fields: {in_one_line(error)}') from error
+    for field in cloud.fields:
+        _check_field(field, _CODES, cloud.point_step)
+    dtype = np.dtype(
+        {
+            'names': distinct([field.name for field in cloud.fields]),
+            'formats': [
+                (_code(cloud, field.datatype), field.count if field.count > 1 else ())
+                for field in cloud.fields
+            ],
+            'offsets': [field.offset for field in cloud.fields],
+            'itemsize': cloud.point_step,
+        }
+    )
     points = _view(cloud, dtype).reshape(-1)
     return points.astype(repack_fields(dtype.newbyteorder('=')))
 
@@ -116,31 +115,6 @@ def write_xyz(cloud: CloudMessage, xyz: npt.NDArray[np.floating]) -> None:
         with np.errstate(over='ignore'):
             for column, values in zip(_views(cloud, 'xyz', _FLOATS).values(), xyz.T, strict=True):
                 column[...] = values.reshape(column.shape)
-
-
-def select_rows(
-    cloud: CloudMessage,
-    mask: npt.NDArray[np.bool_],
-    make_data: Callable[[int], Any] = lambda size: np.empty(size, np.uint8),
-) -> Any:
-    """Every byte of the points where `mask`, (height * width,) bool, is true, in one row.
-
-    `make_data` makes what holds so many bytes.
-    """
-    size = cloud.height * cloud.width
-    if mask.shape != (size,) or mask.dtype != np.bool_:
-        raise PointCloudError(
-            f'mask of shape {mask.shape} and type {mask.dtype}: '
-            f'must be bool of shape ({size},), one per point'
-        )
-    index = np.flatnonzero(mask)
-    data = make_data(len(index) * cloud.point_step)
-    if len(index):
-        # Whole points are 10 times as fast to move as bytes. In any other mode numpy fills an
-        # array of its own first.
-        points = _view(cloud, f'V{cloud.point_step}').reshape(-1)
-        points.take(index, out=np.frombuffer(data, points.dtype), mode='clip')
-    return data
 
 
 def append_columns(
@@ -196,33 +170,29 @@ def _views(
                 f'point cloud: {many} named {name}: must have exactly one; fields: {known}'
             )
         (field,) = matches
+        # Some old writers leave count at 0 and mean 1; PCL reads these too.
+        if field.count not in (0, 1):
+            raise PointCloudError(f'point cloud: field {name} has count {field.count}: must be 1')
         _check_field(field, accepted, cloud.point_step)
         views[name] = _view(cloud, _code(cloud, field.datatype), field.offset)
     return views
 
 
 def _check_field(field: Any, accepted: Collection[int], point_step: int) -> None:
-    """Raise PointCloudError unless a field is one number of an accepted type within the point."""
+    """Raise PointCloudError unless a field is of an accepted type and within the point."""
     problem = ''
     if field.datatype not in accepted:
         kind = _DATATYPE_NAMES.get(field.datatype, 'unknown')
         wanted = ' or '.join(f'{_DATATYPE_NAMES[datatype]} ({datatype})' for datatype in accepted)
         problem = f'has datatype {field.datatype} ({kind}): must be {wanted}'
-    # Some old writers leave count at 0 and mean 1; PCL reads these too.
-    elif field.count not in (0, 1):
-        problem = f'has count {field.count}: must be 1'
     else:
-        problem = _find_problem_of_place(field, point_step)
+        n_bytes = max(field.count, 1) * int(_CODES[field.datatype][1])
+        # numpy adds in 32 bits, and would read outside of the data.
+        if not 0 <= field.offset <= point_step - n_bytes:
+            place = f'at offset {field.offset} of {n_bytes} bytes'
+            problem = f'{place}: must end within point_step {point_step}'
     if problem:
         raise PointCloudError(f'point cloud: field {field.name} {problem}')
-
-
-def _find_problem_of_place(field: Any, point_step: int) -> str:
-    """Say that the numbers of a field are not all within the point; empty if they are."""
-    n_bytes = max(field.count, 1) * int(_CODES[field.datatype][1])
-    if 0 <= field.offset <= point_step - n_bytes:
-        return ''
-    return f'at offset {field.offset} of {n_bytes} bytes: must end within point_step {point_step}'
 
 
 def _view(cloud: CloudMessage, code: npt.DTypeLike, offset: int = 0) -> npt.NDArray[Any]:
@@ -257,16 +227,29 @@ def select_points(
     *,
     are_finite: bool = False,
 ) -> _Message:
-    """Message of the points where `mask` is true: same header, same fields, one row.
+    """Message of the points where `mask`, (height * width,) bool, is true, with all their bytes.
 
-    ``is_dense`` says whether the kept points are all finite; they are looked at unless the caller
-    knows that they `are_finite`. `make_data` makes what the message holds so many bytes in.
-    Raises as `select_rows` and `read_xyz` do.
+    It has the same header and fields, and one row. ``is_dense`` says whether the kept points are
+    all finite; they are looked at unless the caller knows that they `are_finite`. `make_data`
+    makes what the message holds so many bytes in. Raises PointCloudError for another mask, and as
+    `read_xyz` does.
     """
+    size = cloud.height * cloud.width
+    if mask.shape != (size,) or mask.dtype != np.bool_:
+        raise PointCloudError(
+            f'mask of shape {mask.shape} and type {mask.dtype}: '
+            f'must be bool of shape ({size},), one per point'
+        )
+    index = np.flatnonzero(mask)
     kept = copy(cloud)
-    kept.data = select_rows(cloud, mask, make_data)
-    kept.height, kept.width = 1, int(np.count_nonzero(mask))
+    kept.height, kept.width = 1, len(index)
     kept.row_step = kept.width * cloud.point_step
+    kept.data = make_data(kept.row_step)
+    if len(index):
+        # Whole points are 10 times as fast to move as bytes. In any other mode numpy fills an
+        # array of its own first.
+        points = _view(cloud, f'V{cloud.point_step}').reshape(-1)
+        points.take(index, out=np.frombuffer(kept.data, points.dtype), mode='clip')
     kept.is_dense = are_finite or bool(finite_points(read_xyz(kept)).all())
     return kept
 

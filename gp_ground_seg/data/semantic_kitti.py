@@ -16,7 +16,7 @@ from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, four_columns, read_sca
 from gp_ground_seg.data.files import read_bytes
 
 UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70
-"""Classes that say neither ground nor obstacle."""
+"""Classes that are neither ground nor obstacle."""
 GROUND_CLASSES = (40, 44, 48, 49, 60, 72)
 """Road, parking, sidewalk, other ground, lane marking, terrain."""
 FRAME_PERIOD = 0.1  # time between frames [s] where a sequence has no times.txt
@@ -66,7 +66,7 @@ class Frame:
 
 
 def frames(root: str | Path, *sequences: str) -> list[Frame]:
-    """Frames of sequences, as in '02', by default of all, in order; DataError if there are none.
+    """Frames of the named sequences ('02', ...), or of all, in order; DataError without any.
 
     Points and labels of a frame are read each time they are asked for, and not kept.
     """

@@ -9,11 +9,11 @@ import pytest
 from bag_samples import scan, write_ros2_bag
 from cli_runner import error_line, run
 from conftest import REPOSITORY
+from foreign_files import pcd
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.data.cloud_files import WRITABLE, encode_file, read_file
-from gp_ground_seg.data.clouds import cloud_of, name_columns
+from gp_ground_seg.data.cloud_files import WRITABLE, read_file
 from gp_ground_seg.data.inputs import list_inputs
 
 POINTS = scan()
@@ -82,16 +82,38 @@ def test_the_page_says_how_to_read_a_text(tmp_path, monkeypatch, capsys, expecte
     np.testing.assert_allclose(read_file(tmp_path / 'scan.npy').xyz, POINTS[:, :3])
 
 
-def test_output_beside_its_scan_is_no_scan(tmp_path, caplog):
-    for name in ('a', 'a_ground', 'a_ground_obstacles', 'b_ground', 'c_surface'):
-        np.save(tmp_path / f'{name}.npy', POINTS)
+FOLDERS = {
+    'own output': (
+        ['a.npy', 'a_ground.npy', 'a_ground_obstacles.npy', 'b_ground.npy', 'c_surface.npy'],
+        ['a', 'b_ground', 'c_surface'],
+    ),
+    'SemanticKITTI': (['velodyne/000007.bin', 'labels/000007.label'], ['000007']),
+    'nuScenes': (['samples/LIDAR_TOP/a__LIDAR_TOP__1.pcd.bin'], ['a__LIDAR_TOP__1']),
+    'sequences': (['sequences/00/velodyne/0.bin'], r'give one of its sequences \(00\), as in'),
+    'texts': (['a.xyz'], r'no \.bin, .* file in it, .*; a\.xyz may be a text of points'),
+}
+
+
+@pytest.mark.parametrize('kind', FOLDERS)
+def test_what_a_folder_has(tmp_path, caplog, kind):
+    files, expected = FOLDERS[kind]
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
     caplog.set_level('INFO', 'gp_ground_seg')
-    assert [one.name for one in list_inputs(tmp_path)] == ['a', 'b_ground', 'c_surface']
-    assert caplog.messages == ['output of earlier runs left out: 2 of 5 files']
+    if isinstance(expected, str):
+        with pytest.raises(DataError, match=expected):
+            list_inputs(tmp_path)
+    else:
+        assert [one.name for one in list_inputs(tmp_path)] == expected
+    n_left_out = 2 if kind == 'own output' else 0
+    said = f'output of earlier runs left out: {n_left_out} of {len(files)} files'
+    assert caplog.messages == [said] * (n_left_out > 0)
 
 
 def test_clouds_of_a_bag(tmp_path):
-    bag = write_bag(tmp_path)
+    bag = tmp_path / 'drive.mcap'
+    write_ros2_bag(bag)
     inputs = list_inputs(bag)
     assert (len(inputs), inputs.topic, inputs[2].name) == (3, '/points', '000002')
     np.testing.assert_array_equal(inputs[2].read().xyz, scan(2)[:, :3])
@@ -105,26 +127,10 @@ def test_clouds_of_a_bag(tmp_path):
             assert found['ring'].dtype == np.uint16 and len(found['label']) == len(scan(k))
 
 
-def write_bag(folder):
-    write_ros2_bag(folder / 'drive.mcap')
-    return folder / 'drive.mcap'
-
-
-def test_data_sets_are_known_by_their_folders(tmp_path):
-    for name in ('a/sequences/00/velodyne', 'b/samples/LIDAR_TOP'):
-        (tmp_path / name).mkdir(parents=True)
-        POINTS.tofile(tmp_path / name / '000007.bin')
-    with pytest.raises(DataError, match=r'give one of its sequences .*sequences/00'):
-        list_inputs(tmp_path / 'a')
-    for name in ('a/sequences/00', 'b'):
-        (one,) = list_inputs(tmp_path / name)
-        assert one.name == '000007'
-        np.testing.assert_array_equal(one.read().xyz, POINTS)
-
-
 def test_pictures_of_a_frame_of_a_bag_or_folder(tmp_path, capsys):
     pytest.importorskip('matplotlib')
-    bag, out = write_bag(tmp_path), tmp_path / 'a.png'
+    bag, out = tmp_path / 'drive.mcap', tmp_path / 'a.png'
+    write_ros2_bag(bag)
     assert run('plot', 'scan', bag, '--frame', '1', '-o', out) == 0
     first = out.read_bytes()
     assert run('plot', 'scan', bag, '--frame', '2', '-o', out, '--force') == 0
@@ -135,13 +141,8 @@ def test_pictures_of_a_frame_of_a_bag_or_folder(tmp_path, capsys):
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch, capsys):
-    path = tmp_path / 'a.pcd'
-    cloud = cloud_of(name_columns(np.zeros((50, 3), np.float32)))
-    whole = encode_file(path, cloud, {'label': np.zeros(50, np.uint8)})
-    compressed = b'DATA binary_compressed\n' + struct.pack('<II', 9, 50 * 13)
-    path.write_bytes(whole.replace(b'DATA binary\n', compressed))
+    body = struct.pack('<II', 9, 4 * 12)
+    (tmp_path / 'a.pcd').write_bytes(pcd(data='binary_compressed', body=body + bytes(9)))
     monkeypatch.setitem(sys.modules, 'lzf', None)
-    assert run('segment', path, '-o', tmp_path / 'out.npy') == 2
-    line = error_line(capsys)
-    assert line.startswith('lzf is not installed')
-    assert line.endswith('pip install python-neo-lzf')
+    assert run('segment', tmp_path / 'a.pcd', '-o', tmp_path / 'out.npy') == 2
+    assert re.match('lzf is not installed.*pip install python-neo-lzf$', error_line(capsys))

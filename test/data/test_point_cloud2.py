@@ -22,7 +22,7 @@ from gp_ground_seg.data.bags import (
     stamp_of,
     with_stamp,
 )
-from gp_ground_seg.data.point_cloud2 import read_columns, read_xyz
+from gp_ground_seg.data.point_cloud2 import read_columns, read_fields, read_xyz
 
 FLOAT32, FLOAT64 = 7, 8
 STRUCT_CODES = dict(enumerate('bBhHiIfd', 1))
@@ -38,7 +38,8 @@ class Field(NamedTuple):
     count: int = 1
 
 
-class Layout(NamedTuple):
+@dataclasses.dataclass
+class Layout:
     """The attributes of a message that are read."""
 
     height: int
@@ -99,13 +100,10 @@ def test_coordinates_and_selections_agree_with_struct(case, random):
         xyz = xyz.astype(np.float64)
     np.testing.assert_array_equal(xyz, np.reshape(expected, (-1, 3)))
     mask = np.array([random.random() < 0.5 for _ in points], dtype=bool)
-    selected = point_cloud2.select_rows(layout, mask)
-    assert selected.tobytes() == b''.join(itertools.compress(points, mask))
-    # Whatever is not kept is in the complement: nothing is lost or doubled.
-    assert (
-        len(selected) + len(point_cloud2.select_rows(layout, ~mask))
-        == len(points) * layout.point_step
-    )
+    for chosen in (mask, ~mask):
+        selected = point_cloud2.select_points(layout, chosen, bytearray, are_finite=True)
+        assert selected.data == b''.join(itertools.compress(points, chosen))
+        assert (selected.height, selected.width) == (1, chosen.sum())
 
 
 @given(layouts(), st.data())
@@ -137,8 +135,8 @@ def test_points_stay_and_columns_follow(case, data):
             (value,) = struct.unpack_from(order + STRUCT_CODES[datatype], new, offset)
             np.testing.assert_equal(np.array(value, TYPES[datatype]), columns[name][k])
 
-    wider = layout._replace(
-        fields=[Field(*column) for column in placed], data=bytes(wide),
+    wider = dataclasses.replace(
+        layout, fields=[Field(*column) for column in placed], data=bytes(wide),
         point_step=step, row_step=layout.width * step,
     )  # fmt: skip
     found = read_columns(wider, list(columns))
@@ -152,7 +150,7 @@ def kitti_layout(n=5, **changes):
     rng = np.random.default_rng(0)
     fields = [Field(name, 4 * k, FLOAT32) for k, name in enumerate(('x', 'y', 'z', 'intensity'))]
     data = rng.normal(size=(n, 4)).astype('<f4').tobytes()
-    return Layout(1, n, fields, False, 16, 16 * n, data)._replace(**changes)
+    return dataclasses.replace(Layout(1, n, fields, False, 16, 16 * n, data), **changes)
 
 
 def replaced(name, /, **changes):
@@ -173,71 +171,58 @@ def test_coordinates_side_by_side_are_not_copied():
 def test_what_is_not_needed_is_not_checked():
     empty = Layout(0, 0, [], False, 0, 0, b'')
     assert read_xyz(empty).shape == (0, 3)
-    assert len(point_cloud2.select_rows(empty, np.zeros(0, dtype=bool))) == 0
     cloud = cloud_from_columns((0, 0), 'lidar', {})
     assert point_cloud2.select_points(cloud, np.zeros(0, dtype=bool)).width == 0
     layout = kitti_layout(row_step=0)
     np.testing.assert_array_equal(read_xyz(layout), read_xyz(kitti_layout()))
-    assert (
-        point_cloud2.select_rows(layout, np.ones(5, dtype=bool)).tobytes() == kitti_layout().data
-    )
+    assert ALL(layout).data.tobytes() == kitti_layout().data
 
 
-def in_z(**changes):
-    return {'fields': replaced('z', **changes)}
+def field(name, /, **changes):
+    return {'fields': replaced(name, **changes)}
 
 
-@pytest.mark.parametrize(
-    ('changes', 'message'),
-    [
-        ({'fields': []}, r'no field named x: must have exactly one; fields: none'),
-        (in_z(name='height'), r'no field named z.*x, y, height, intensity'),
-        ({'fields': replaced('intensity', name='y')}, r'2 fields named y: must have exactly one'),
-        (in_z(datatype=4), r'z has datatype 4 \(UINT16\): must be FLOAT32 \(7\) or FLOAT64 \(8\)'),
-        (in_z(datatype=77), r'field z has datatype 77 \(unknown\)'),
-        (in_z(count=3), r'field z has count 3: must be 1'),
-        (in_z(offset=13), r'z at offset 13 of 4 bytes.*point_step 16'),
-        (in_z(offset=-4), r'z at offset -4'),
-        ({'point_step': 0}, r'point_step 0: must be at least 1'),
-        ({'width': 6}, r'data of 80 bytes: must be at least 96 \(height 1, width 6'),
-        ({'data': b''}, r'data of 0 bytes: must be at least 80'),
-        ({'height': 5, 'width': 1, 'row_step': 15}, r'row_step 15: must be at least 16 \(width 1'),
-        ({'height': 2, 'row_step': 2**32 - 1}, r'data of 80 bytes: must be at least'),
-        ({'row_step': 81}, r'row_step 81: must be at most the 80 bytes of data'),
-    ],
-)
-def test_malformed_layout_says_what_and_where(changes, message):
+def append(layout):
+    return point_cloud2.append_columns(layout, {'a': np.ones(5, np.uint8)})
+
+
+def selecting(mask):
+    return lambda layout: point_cloud2.select_points(layout, mask)
+
+
+ALL = selecting(np.ones(5, bool))
+WRONG = [
+    (read_xyz, {'fields': []}, r'no field named x: must have exactly one; fields: none'),
+    (read_xyz, field('z', name='up'), r'no field named z.*x, y, up, intensity'),
+    (read_xyz, field('intensity', name='y'), r'2 fields named y: must have exactly one'),
+    (read_xyz, field('z', datatype=4),
+     r'z has datatype 4 \(UINT16\): must be FLOAT32 \(7\) or FLOAT64 \(8\)'),
+    (read_xyz, field('z', datatype=77), r'field z has datatype 77 \(unknown\)'),
+    (read_xyz, field('z', count=3), r'field z has count 3: must be 1'),
+    (read_xyz, field('z', offset=13), r'z at offset 13 of 4 bytes.*point_step 16'),
+    (read_xyz, field('z', offset=-4), r'z at offset -4'),
+    (read_xyz, {'point_step': 0}, r'point_step 0: must be at least 1'),
+    (read_xyz, {'width': 6}, r'data of 80 bytes: must be at least 96 \(height 1, width 6'),
+    (read_xyz, {'height': 5, 'width': 1, 'row_step': 15}, r'row_step 15: must be at least 16'),
+    (read_xyz, {'height': 2, 'row_step': 2**32 - 1}, r'data of 80 bytes: must be at least'),
+    (read_xyz, {'row_step': 81}, r'row_step 81: must be at most the 80 bytes of data'),
+    # numpy adds in 32 bits: an offset of 2^31 - 1 ended the process.
+    *((read_fields, field('intensity', offset=offset, count=count),
+       f'intensity at offset {offset} .*point_step 16')
+      for offset, count in [(13, 1), (12, 2), (2**31 - 1, 1), (4, 2**30)]),
+    (read_fields, field('x', datatype=9), r'field x has datatype 9 \(unknown\)'),
+    (lambda cloud: read_columns(cloud, ['z']), {'width': 0, **field('z', count=2)}, 'count 2'),
+    (ALL, {'data': bytes(70)}, r'data of 70 bytes: must be at least 80'),
+    (append, {'data': bytes(70)}, r'data of 70 bytes: must be at least 80'),
+    (selecting(np.ones(4, bool)), {}, r'mask of shape \(4,\).*bool of shape \(5,\)'),
+    (selecting(np.ones(5, np.uint8)), {}, 'type uint8'),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(('call', 'changes', 'message'), WRONG)
+def test_what_cannot_be_is_refused_and_says_where(call, changes, message):
     with pytest.raises(PointCloudError, match=message):
-        read_xyz(kitti_layout(**changes))
-
-
-@pytest.mark.parametrize(
-    'changes', [{'name': 'w'}, {'name': 'x'}, {'count': 2}, {'offset': 14}, {'datatype': 9}]
-)
-@pytest.mark.parametrize('n_points', [0, 5])
-def test_a_column_that_is_no_single_number_is_refused(changes, n_points):
-    with pytest.raises(PointCloudError, match=r'point cloud: .*field'):
-        read_columns(kitti_layout(width=n_points, **in_z(**changes)), ['x', 'z'])
-
-
-@pytest.mark.parametrize(('offset', 'count'), [(13, 1), (12, 2), (2**31 - 1, 1), (4, 2**30)])
-def test_a_field_beyond_its_point_is_refused_where_every_field_is_read(offset, count):
-    """numpy adds in 32 bits: an offset of 2^31 - 1 ended the process."""
-    fields = replaced('intensity', offset=offset, count=count)
-    with pytest.raises(PointCloudError, match=f'intensity at offset {offset} .*point_step 16'):
-        point_cloud2.read_fields(kitti_layout(fields=fields))
-
-
-def test_select_and_append_refuse_what_they_cannot_read():
-    keep, short = np.ones(5, dtype=bool), kitti_layout(data=bytes(70))
-    with pytest.raises(PointCloudError, match=r'data of 70 bytes: must be at least 80'):
-        point_cloud2.select_rows(short, keep)
-    with pytest.raises(PointCloudError, match=r'data of 70 bytes: must be at least 80'):
-        point_cloud2.append_columns(short, {'a': keep.astype(np.uint8)})
-    with pytest.raises(PointCloudError, match=r'mask of shape \(4,\).*bool of shape \(5,\)'):
-        point_cloud2.select_rows(kitti_layout(), keep[:4])
-    with pytest.raises(PointCloudError, match=r'type uint8'):
-        point_cloud2.select_rows(kitti_layout(), keep.astype(np.uint8))
+        call(kitti_layout(**changes))
 
 
 def assert_same_cloud(cloud, expected):

@@ -34,48 +34,38 @@ def test_points_come_back_bit_for_bit_and_labels_are_the_lower_half(
 
 
 def test_files_of_another_size_or_none_are_refused(tmp_path):
-    path = tmp_path / 'a.bin'
-    for n_bytes in (1, 15, 17, 100):
-        path.write_bytes(bytes(n_bytes))
-        with pytest.raises(DataError, match=rf'a\.bin: {n_bytes} bytes is not a whole number'):
-            read_points(path)
-    for n_points in (0, 24, 26):
-        with pytest.raises(DataError, match=f'100 bytes, expected {4 * n_points} for {n_points}'):
-            read_labels(path, n_points)
-
-    for name in ('missing.bin', ''):
-        with pytest.raises(DataError, match=str(tmp_path / name)):
-            read_points(tmp_path / name)
-        with pytest.raises(DataError, match=str(tmp_path / name)):
-            read_labels(tmp_path / name, 0)
+    (tmp_path / 'a.bin').write_bytes(bytes(100))
+    for call, name, message in (
+        (read_points, 'a.bin', '100 bytes is not a whole number of points'),
+        (lambda path: read_labels(path, 24), 'a.bin', '100 bytes, expected 96 for 24 points'),
+        (lambda path: read_labels(path, 26), 'a.bin', '100 bytes, expected 104 for 26 points'),
+        (read_points, 'missing.bin', 'No such file'),
+        (lambda path: read_labels(path, 0), '', 'Is a directory'),
+    ):
+        with pytest.raises(DataError, match=f'{tmp_path / name}: {message}'):
+            call(tmp_path / name)
 
 
-def test_sequences_are_sorted_and_need_scans(tmp_path):
-    for root in (tmp_path, tmp_path / 'missing'):
-        with pytest.raises(DataError, match='no sequences/'):
-            list_sequences(root)
-        with pytest.raises(DataError, match='no sequences/'):
-            list_frames(root, '00')
-    write_streets(tmp_path, s08=1, s00=1, s10=1)
-    (tmp_path / 'sequences' / '03').mkdir()
-    (tmp_path / 'sequences' / 'notes.txt').write_text('')
-    assert list_sequences(tmp_path) == list_sequences(str(tmp_path)) == ['00', '08', '10']
-    with pytest.raises(DataError, match='sequences here: 00, 08, 10'):
-        list_frames(tmp_path, '01')
-    (tmp_path / 'sequences/00/velodyne/000000.bin').unlink()
-    with pytest.raises(DataError, match=r'no \.bin file'):
-        list_frames(tmp_path, '00')
-
-
-def test_frames_in_order_with_and_without_labels(tmp_path):
+def test_sequences_and_frames_are_sorted_and_need_scans(tmp_path):
+    with pytest.raises(DataError, match='no sequences/'):
+        list_sequences(tmp_path)
+    write_streets(tmp_path, s08=1, s10=1)
     points, semantic = street()
     for index in (10, 2, 1):
         write_frame(tmp_path, '00', index, points, semantic if index != 2 else None)
+    (tmp_path / 'sequences' / '03').mkdir()
+    (tmp_path / 'sequences' / 'notes.txt').write_text('')
+    assert list_sequences(tmp_path) == list_sequences(str(tmp_path)) == ['00', '08', '10']
     frames = list_frames(tmp_path, '00')
     assert [frame.index for frame in frames] == ['000001', '000002', '000010']
     assert [frame.labels_path is not None for frame in frames] == [True, False, True]
     assert all(frame.sequence == '00' for frame in frames)
     assert frames[0].points_path.read_bytes() == points.tobytes()
+    with pytest.raises(DataError, match='sequences here: 00, 08, 10'):
+        list_frames(tmp_path, '01')
+    (tmp_path / 'sequences/08/velodyne/000000.bin').unlink()
+    with pytest.raises(DataError, match=r'no \.bin file'):
+        list_frames(tmp_path, '08')
 
 
 def test_times_belong_to_the_numbers_of_the_files(tmp_path):
