@@ -59,8 +59,6 @@ def test_a_misspelt_command_is_one_line(word, hint, capsys):
         ('plot a.pcd -o b', 'plot: a.pcd: no command; {near gp-ground-seg plot scan a.pcd}'),
         ('evaluate R --sequences 00 08', 'evaluate: unrecognized arguments: 08; '
          'the list must be without spaces, as in --sequences 00,08'),
-        ('plot segment A -o B --seg 1 2 3', 'plot segment: unrecognized arguments: 2 3; '
-         'the list must be without spaces, as in --seg 1,2'),
         ('plot segment A -o B --segment 1,',
          "plot segment: --segment: '1,': must be whole numbers, as in 157,158"),
         ('evaluate R 00', 'evaluate: unrecognized arguments: 00; {help evaluate}'),
