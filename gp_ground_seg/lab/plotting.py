@@ -22,7 +22,12 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.points import check_points
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.files import staged_file, writing
-from gp_ground_seg.lab.scoring.metrics import Labels, check_lengths
+from gp_ground_seg.lab.scoring.metrics import (
+    Labels,
+    check_lengths,
+    count_labels,
+    label_ratios,
+)
 
 COLOURS = {
     'ground': '#B9BFC6',
@@ -162,20 +167,19 @@ def label_layers(label: Labels, truth: Labels | None = None) -> tuple[str, Layer
     With the true labels, UNKNOWN where a point does not count, those of the errors.
     """
     layers = {'ground': label == Label.GROUND, 'obstacle': label == Label.OBSTACLE}
-    n_points, n_given, n_obstacle = len(label), *(int(part.sum()) for part in layers.values())
     if truth is None:
-        words = f'{in_thousands(n_points)} points: {in_thousands(n_given)} ground'
-        words += f', {in_thousands(n_obstacle)} obstacle'
-        n_unknown = n_points - n_given - n_obstacle
-        return f'{words}, {in_thousands(n_unknown)} unknown' if n_unknown else words, layers
-    given, ground = layers['ground'], truth == Label.GROUND
-    layers['missed ground'] = ground & ~given
-    layers['false ground'] = given & (truth == Label.OBSTACLE)
-    n_missed, n_false = (int(layers[name].sum()) for name in ('missed ground', 'false ground'))
-    words = f'{in_thousands(n_false)} false ground, {in_thousands(n_missed)} missed ground'
-    if n_union := int(ground.sum()) + n_false:
-        words += f', IoU {100.0 * (1.0 - (n_missed + n_false) / n_union):.2f} %'
-    return words, layers
+        counts = {name: int(layer.sum()) for name, layer in layers.items()}
+        counts['unknown'] = len(label) - sum(counts.values())
+        words = [f'{in_thousands(n)} {name}' for name, n in counts.items() if n or name in layers]
+        return f'{in_thousands(len(label))} points: {", ".join(words)}', layers
+    layers['missed ground'] = (truth == Label.GROUND) & ~layers['ground']
+    layers['false ground'] = layers['ground'] & (truth == Label.OBSTACLE)
+    n_false, n_missed = (
+        in_thousands(layers[f'{kind} ground'].sum()) for kind in ('false', 'missed')
+    )
+    iou = 100.0 * label_ratios(count_labels(label, truth))['iou']
+    score = f', IoU {iou:.2f} %' if np.isfinite(iou) else ''
+    return f'{n_false} false ground, {n_missed} missed ground{score}', layers
 
 
 CANDIDATE_COLOUR = '#56636E'

@@ -188,11 +188,6 @@ def _is_admitted(request: Any, token: str) -> bool:
     )
 
 
-def text(words: object) -> str:
-    """Return HTML that shows `words` as they are: names and messages may come from a file."""
-    return html.escape(str(words))
-
-
 def box(content: str) -> str:
     """Return HTML `content` in the small type of viser's controls."""
     return f'<div style="font-size:12px;padding:4px 12px">{content}</div>'
@@ -373,7 +368,8 @@ def _tell(place: Any, action: Callable[[], str]) -> None:
         words = action()
     except Exception as error:
         words = str(error) if isinstance(error, GroundSegError) else repr(error)
-    place.content = box(text(words)) if words else ''
+    # Names and messages may come from a file.
+    place.content = box(html.escape(words)) if words else ''
 
 
 def _table(result: Segmentation, before: Labels, scores: Sequence[dict[str, float]]) -> str:
