@@ -1,4 +1,4 @@
-"""``plot``: pictures of a segmented scan: in perspective, or one segment of it."""
+"""``plot``: pictures of a segmented scan: in perspective, or segments of it from the side."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ import math
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
-from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.files import check_writable
@@ -31,29 +29,20 @@ Draw a scan in perspective: ground grey, obstacles orange; with --labels missed 
 false ground purple.
 """
 SCAN_EXAMPLES = """\
-  gp-ground-seg plot scan 000000.bin -o scan.png
   gp-ground-seg plot scan drive.mcap --frame 20 -o scan.png
-  gp-ground-seg plot scan 000000.pcd -o scan.svg
-  gp-ground-seg plot scan 000000.bin --camera 90,30,40 -o from_the_left.pdf
+  gp-ground-seg plot scan 000000.bin --camera 90,30,40 -o from_the_left.svg
   gp-ground-seg plot scan velodyne/000000.bin --labels labels/000000.label -o errors.png
 """
-
 SEGMENT = """\
 The paper's Figure 1 for any scan and segment, or two side by side: points, ground
 candidates, the lines through them with their critical points, the inliers, and the
 estimated ground with twice its standard deviation; below it the length-scale and its
-pseudo-inputs.
+pseudo-inputs. Segments are numbered counter-clockwise from straight behind.
 """
 SEGMENT_EXAMPLES = """\
-  gp-ground-seg plot segment 000000.bin --segment 157 -o segment.png
   gp-ground-seg plot segment 000000.bin --azimuth 0 -o ahead.pdf
-  gp-ground-seg plot segment velodyne/000000.bin --labels labels/000000.label \\
-      --segment 157,158 -o pair.png
-
-Segments are numbered counter-clockwise from straight behind.
+  gp-ground-seg plot segment 000000.bin --segment 157,158 -o pair.png
 """
-
-
 KINDS = ('.png', '.pdf', '.svg')
 ENDINGS = ' or '.join(KINDS)
 
@@ -64,12 +53,25 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     examples = SCAN_EXAMPLES + SEGMENT_EXAMPLES
     parser = options.new_parser(subparsers, 'plot', description, examples)
     pictures = parser.add_subparsers(metavar='PICTURE', required=True, dest='picture')
-    for name, text, examples, purpose, declare in (
-        ('scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective', _declare_scan),
-        ('segment', SEGMENT, SEGMENT_EXAMPLES, 'a segment from the side', _declare_segment),
-    ):
-        picture = options.new_parser(pictures, name, text, examples, purpose)
-        declare(picture)
+    scan = options.new_parser(pictures, 'scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective')
+    scan.add_argument(
+        '--camera', metavar='AZIMUTH,ELEVATION,DISTANCE', type=_camera, default=CAMERA,
+        help='where it stands, seen from the middle of the scene: counter-clockwise from ahead '
+        '[deg], upwards [deg], away [m] (default: 196,24,32)',
+    )  # fmt: skip
+    segment = options.new_parser(
+        pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, 'a segment from the side'
+    )
+    which = segment.add_mutually_exclusive_group(required=True)
+    which.add_argument(
+        '--segment', metavar='N[,N]', type=_integers,
+        help='number of the segment, or of several side by side',
+    )  # fmt: skip
+    which.add_argument(
+        '--azimuth', metavar='DEG', type=_degrees,
+        help='the segment in this direction, 90 = left',
+    )  # fmt: skip
+    for picture in (scan, segment):
         options.add(
             picture,
             ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
@@ -84,25 +86,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         picture.set_defaults(run=run)
 
 
-def _declare_scan(parser: argparse.ArgumentParser) -> None:
-    camera = {'metavar': 'AZIMUTH,ELEVATION,DISTANCE', 'type': _camera, 'default': CAMERA}
-    options.add(
-        parser,
-        ('--camera', 'where it stands, seen from the middle of the scene: counter-clockwise '
-         'from ahead [deg], upwards [deg], away [m] (default: 196,24,32)', camera),
-    )  # fmt: skip
-
-
-def _declare_segment(parser: argparse.ArgumentParser) -> None:
-    options.add(
-        parser,
-        ('--segment', 'number of the segment, or of several side by side; or give --azimuth',
-         {'metavar': 'N[,N]', 'type': _integers}),
-        ('--azimuth', 'the segment in this direction, 90 = left',
-         {'metavar': 'DEG', 'type': float}),
-    )  # fmt: skip
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Segment the scan and draw it."""
     config = options.read_config(arguments)
@@ -110,10 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
     if path.suffix.lower() not in KINDS:
         raise DataError(f'{path}: must end in {ENDINGS}')
     check_writable(path, force=arguments.force)
-    if arguments.picture == 'segment' and [arguments.segment, arguments.azimuth].count(None) != 1:
-        raise DataError('plot segment: must be given one of --segment and --azimuth')
-    points, title = _read(arguments)
-    truth = None
+    scan = options.list_clouds(arguments)[arguments.frame]
+    points, title, truth = scan.read().xyz, shown(scan.title), None
     if arguments.labels is not None:
         truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
     used = options.spare_compiling(config, 1)
@@ -122,7 +103,9 @@ def run(arguments: argparse.Namespace) -> int:
         camera = arguments.camera
         said = plot_scan_view(points, result.label, path, title, camera, truth=truth)
     else:
-        segments = _segment_numbers(arguments, config)
+        segments: list[int] | None = arguments.segment
+        if segments is None:
+            segments = [segment_at(math.radians(arguments.azimuth), config.grid.n_segments)]
         plot_segment(result, config, points, segments, path, truth, title)
         said = '; '.join(_segment_counts(result, segment) for segment in segments)
     print(f'{said}, written to {shown(path)}')
@@ -139,6 +122,14 @@ def _integers(text: str) -> list[int]:
         raise argparse.ArgumentTypeError(message) from None
 
 
+def _degrees(text: str) -> float:
+    """Read an angle [deg]."""
+    value = float(text)
+    if not abs(value) <= 360.0:
+        raise argparse.ArgumentTypeError(f'{text}: must be a number of degrees, -360 to 360')
+    return value
+
+
 def _camera(text: str) -> Place:
     """Read azimuth, elevation and distance; straight from above no side of a picture is up."""
     try:
@@ -149,24 +140,6 @@ def _camera(text: str) -> Place:
         wanted = 'azimuth within 360 and elevation within 89 degrees, distance 1 to 1000 m'
         raise argparse.ArgumentTypeError(f'{text!r}: must be {wanted}, as in 90,30,40')
     return camera_at(azimuth, elevation, distance)
-
-
-def _read(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], str]:
-    """Points of a scan, and its name as in ``00/000005``."""
-    scan = options.list_clouds(arguments)[arguments.frame]
-    folder = Path(str(scan.path)).resolve().parent
-    title = f'{folder.parent.name}/{scan.name}' if folder.name == 'velodyne' else scan.title
-    return scan.read().xyz, shown(title)
-
-
-def _segment_numbers(arguments: argparse.Namespace, config: Config) -> list[int]:
-    chosen: list[int] | None = arguments.segment
-    if chosen is not None:
-        return chosen
-    if not abs(arguments.azimuth) <= 360.0:
-        wanted = 'a number of degrees, -360 to 360'
-        raise DataError(f'--azimuth {arguments.azimuth:g}: must be {wanted}')
-    return [segment_at(math.radians(arguments.azimuth), config.grid.n_segments)]
 
 
 def _segment_counts(result: Segmentation, segment: int) -> str:

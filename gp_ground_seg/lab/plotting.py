@@ -1,10 +1,9 @@
 """Pictures: a segmented scan in perspective, and the paper's Figure 1, segments from the side.
 
-Their colours are those of the page of `tune`, of RViz and of Foxglove too.
+The page of `tune`, RViz and Foxglove use the same colours.
 
-The only module that imports matplotlib. Every function that draws raises
-`MissingDependencyError` where it is not installed, and `DataError` where the file cannot be
-written.
+This is the only module that imports matplotlib. A function that draws raises
+`MissingDependencyError` if it is not installed, and `DataError` if the file cannot be written.
 """
 
 from __future__ import annotations
@@ -23,7 +22,12 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.points import check_points
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.files import staged_file, writing
-from gp_ground_seg.lab.scoring.metrics import Labels, check_lengths
+from gp_ground_seg.lab.scoring.metrics import (
+    Labels,
+    check_lengths,
+    count_labels,
+    label_ratios,
+)
 
 COLOURS = {
     'ground': '#B9BFC6',
@@ -40,21 +44,21 @@ HEIGHTS = (-0.5, 3.0)
 UNKNOWN = (0.5, 0.5, 0.5)
 """Colour of a value that is not known."""
 
-# Lightness rises evenly from one to the next, and hue only goes from blue to yellow: that
-# is told apart with any of the common colour vision deficiencies, and in print.
+# Lightness rises evenly from blue to yellow: with every common colour vision deficiency, and in
+# print, the order is seen.
 _RAMP = np.array(
     [[0.02, 0.12, 0.40], [0.16, 0.30, 0.56], [0.36, 0.47, 0.60],
      [0.58, 0.63, 0.56], [0.82, 0.79, 0.42], [1.00, 0.95, 0.50]]
 )  # fmt: skip
-DPI, SEGMENT_DPI = 120, 130
+DPI = 120
 GREEN, VIOLET = '#009E73', '#7A4FA3'
-"""Of Okabe and Ito's palette, and one that is told apart from it with any colour vision."""
+"""Of Okabe and Ito's palette, and one that differs from it with any colour vision."""
 
 
 def ramp_colours(values: FloatArray, low: float, high: float) -> FloatArray:
     """Return colours from dark blue at `low` to pale yellow at `high`, low < high.
 
-    Values beyond take the colour of the end, and NaN that of `UNKNOWN`. Returns red, green and
+    Values beyond take the colour of the end, NaN and infinity `UNKNOWN`. Returns red, green and
     blue in [0, 1], (..., 3).
     """
     known = np.isfinite(values)
@@ -65,25 +69,20 @@ def ramp_colours(values: FloatArray, low: float, high: float) -> FloatArray:
     return colours
 
 
-def new_figure(width: float, height: float, dpi: int = DPI) -> Any:
+def new_figure(width: float, height: float) -> Any:
     """Return an empty matplotlib figure [inch] outside pyplot's global state."""
-    return require('matplotlib.figure', 'matplotlib').Figure((width, height), dpi=dpi)
+    return require('matplotlib.figure', 'matplotlib').Figure((width, height), dpi=DPI)
 
 
 def save(figure: Any, path: str | Path) -> None:
-    """Write a figure as PDF or SVG where `path` ends so, else as PNG, replacing the file."""
-    from matplotlib import rc_context
-
-    kind = {'.pdf': 'pdf', '.svg': 'svg'}.get(Path(path).suffix.lower(), 'png')
-    # With their dates, and names by chance, no two files would be equal.
-    metadata = {'pdf': {'CreationDate': None}, 'svg': {'Date': None}}.get(kind, {})
-    same_names = rc_context({'svg.hashsalt': 'gp_ground_seg'})
-    with staged_file(path, force=True) as part, same_names, writing(path):
-        figure.savefig(part, format=kind, metadata=metadata)
+    """Write a figure in the format that `path` ends in, or as PNG, replacing the file."""
+    kind = Path(path).suffix[1:].lower() or 'png'
+    with staged_file(path, force=True) as part, writing(path):
+        figure.savefig(part, format=kind)
 
 
-# Size of the scene, of the title above it and of the legend below it [inch].
-WIDTH, HEIGHT, TITLE, FOOT = 12.0, 6.0, 0.4, 0.6
+# Size of the scene, and of the legend below it [inch].
+WIDTH, HEIGHT, FOOT = 12.0, 6.0, 0.6
 CLOSEST = 1.0
 """Nothing nearer to the camera than this is drawn [m]."""
 # Places of the camera and of the middle of the picture, sensor frame [m].
@@ -93,9 +92,7 @@ ZOOM = 0.75
 
 Place = tuple[float, float, float]
 Layers = dict[str, BoolArray]
-"""Which points, (N,), are drawn in each of `COLOURS`."""
-DEPTHS = {'ground': 1, 'obstacle': 2, 'missed ground': 3, 'false ground': 3}
-"""Layers of points from below."""
+"""Which points, (N,), are drawn in each of `COLOURS`, the lowest layer first."""
 
 
 def plot_scan_view(
@@ -116,20 +113,21 @@ def plot_scan_view(
     xyz = check_points(points)
     check_lengths(len(xyz), label=label, truth=truth)
     said, layers = label_layers(label, truth)
-    whole = FOOT + HEIGHT + (TITLE if title else 0.0)
-    figure = new_figure(WIDTH, whole)
-    figure.text(
-        0.5, 1.0 - 0.5 * TITLE / whole, title,
-        ha='center', va='center', parse_math=False, fontsize=14,
-    )  # fmt: skip
-    # matplotlib's own layouts leave no room for a legend below equal axes.
-    axes = figure.add_axes((0.0, FOOT / whole, 1.0, HEIGHT / whole))
-    _draw_points(axes, xyz, layers, camera)
+    figure, foot = new_figure(WIDTH, HEIGHT + FOOT), FOOT / (HEIGHT + FOOT)
+    axes = figure.add_axes((0.0, foot, 1.0, 1.0 - foot))
     axes.set_axis_off()
-    axes.set_aspect('equal')
     axes.set_xlim(-0.5, 0.5)
     axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
-    for name in layers:  # dots as small as in the picture would show no colour
+    figure.text(0.5, 0.96, title, ha='center', parse_math=False, fontsize=14)
+    place, depth = project(xyz, camera)
+    for name, layer in layers.items():
+        chosen = np.flatnonzero(layer & (depth > CLOSEST))
+        chosen = chosen[np.argsort(-depth[chosen])]  # far points first
+        axes.scatter(
+            *place[chosen].T, s=np.clip(60.0 / depth[chosen], 1.0, 5.0), linewidths=0.0,
+            rasterized=True, c=COLOURS[name],
+        )  # fmt: skip
+        # Dots as small as in the picture would show no colour in the legend.
         axes.plot([], [], 'o', markersize=7, color=COLOURS[name], label=name)
     figure.legend(loc='lower left', fontsize=11, frameon=False, ncols=4)
     save(figure, path)
@@ -163,47 +161,29 @@ def project(points: FloatArray, camera: Place = CAMERA) -> tuple[FloatArray, Flo
     return place, depth
 
 
-def _draw_points(axes: Any, xyz: FloatArray, layers: Layers, camera: Place) -> None:
-    """Draw far points first, and the ground below all obstacles."""
-    place, depth = project(xyz, camera)
-    for name, layer in layers.items():
-        chosen = np.flatnonzero(layer & (depth > CLOSEST))
-        chosen = chosen[np.argsort(-depth[chosen])]
-        axes.scatter(
-            *place[chosen].T, s=np.clip(60.0 / depth[chosen], 1.0, 5.0), linewidths=0.0,
-            rasterized=True, c=COLOURS[name], zorder=DEPTHS[name],
-        )  # fmt: skip
-
-
 def label_layers(label: Labels, truth: Labels | None = None) -> tuple[str, Layers]:
     """Return numbers of points in words, and the layers of their labels (N,).
 
     With the true labels, UNKNOWN where a point does not count, those of the errors.
     """
     layers = {'ground': label == Label.GROUND, 'obstacle': label == Label.OBSTACLE}
-    n_points, n_given, n_obstacle = len(label), *(int(part.sum()) for part in layers.values())
     if truth is None:
-        words = f'{in_thousands(n_points)} points: {in_thousands(n_given)} ground'
-        words += f', {in_thousands(n_obstacle)} obstacle'
-        n_unknown = n_points - n_given - n_obstacle
-        return f'{words}, {in_thousands(n_unknown)} unknown' if n_unknown else words, layers
-    given, ground = layers['ground'], truth == Label.GROUND
-    layers['missed ground'] = ground & ~given
-    layers['false ground'] = given & (truth == Label.OBSTACLE)
-    n_missed, n_false = (int(layers[name].sum()) for name in ('missed ground', 'false ground'))
-    words = f'{in_thousands(n_false)} false ground, {in_thousands(n_missed)} missed ground'
-    if n_union := int(ground.sum()) + n_false:
-        words += f', IoU {100.0 * (1.0 - (n_missed + n_false) / n_union):.2f} %'
-    return words, layers
+        counts = {name: int(layer.sum()) for name, layer in layers.items()}
+        counts['unknown'] = len(label) - sum(counts.values())
+        words = [f'{in_thousands(n)} {name}' for name, n in counts.items() if n or name in layers]
+        return f'{in_thousands(len(label))} points: {", ".join(words)}', layers
+    layers['missed ground'] = (truth == Label.GROUND) & ~layers['ground']
+    layers['false ground'] = layers['ground'] & (truth == Label.OBSTACLE)
+    n_false, n_missed = (
+        in_thousands(layers[f'{kind} ground'].sum()) for kind in ('false', 'missed')
+    )
+    iou = 100.0 * label_ratios(count_labels(label, truth))['iou']
+    score = f', IoU {iou:.2f} %' if np.isfinite(iou) else ''
+    return f'{n_false} false ground, {n_missed} missed ground{score}', layers
 
-
-# Inches: the panels of one segment, those of each of several, and the legend beside them.
-PANEL, PANEL_OF_SEVERAL, PANELS_HEIGHT, LEGEND = 9.6, 7.2, 7.6, 2.6
 
 CANDIDATE_COLOUR = '#56636E'
-LINE_COLOUR = GREEN
-SURFACE_COLOUR = '#111111'
-PSEUDO_INPUT_COLOUR = VIOLET
+LINE_COLOUR, SURFACE_COLOUR, PSEUDO_INPUT_COLOUR = GREEN, '#111111', VIOLET
 
 # Metres kept free below and above the ground, and beyond the last candidate; and the distance
 # from the ground up to which a candidate is always in the picture.
@@ -228,60 +208,34 @@ def plot_segment(
     """Draw segments from the side, side by side; below each the length-scale and pseudo-inputs.
 
     `result` is the segmentation of `points`, (N, >=3) [m], under `config`. `truth` (N,) are true
-    labels, UNKNOWN where a point does not count. The range is a little more than that of the last
-    candidate. The file `path`, a PDF or else a PNG, is replaced.
+    labels, UNKNOWN where a point does not count. The axes end a little beyond the last candidate.
+    The file `path` is replaced.
     """
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
     check_lengths(len(z), result=result.label, truth=truth)
     views = [SegmentView(result, segment, z) for segment in segments]
-    reach = max(view.reach() for view in views)
-    lows, highs = zip(*(view.heights_shown(reach) for view in views), strict=True)
-    low, high = min(lows), max(highs)
-    figure, panels = _panels(len(views))
-    scales, with_pseudo_inputs = [], config.length_scale.model == 'latent'
+    figure = new_figure(5.0 + 6.5 * len(views), 7.6)
+    figure.set_layout_engine('constrained')
+    shared = {'sharex': True, 'sharey': 'row', 'squeeze': False}
+    panels = figure.subplots(2, len(views), height_ratios=(2.6, 1.0), **shared)
     for view, (above, below) in zip(views, panels.T, strict=True):
-        n_hidden = np.count_nonzero((view.r > reach) | (view.z < low) | (view.z > high))
         name = f'{title}, {view.name}' if title else view.name
-        name = f'{name}; {n_hidden} points outside'
         above.set_title(name, fontsize=12, loc='left', parse_math=False)
         view.draw_points(above, truth)
         view.draw_ground(above)
-        view.draw_length_scale(below, reach, with_pseudo_inputs=with_pseudo_inputs)
-        scales.append(below.get_ylim())
+        view.draw_length_scale(below, config)
         title = ''
+    reach = max(view.reach() for view in views)
+    lows, highs = zip(*(view.heights_shown(reach) for view in views), strict=True)
     panels[0, 0].set_xlim(0.0, reach)
-    panels[0, 0].set_ylim(low, high)
-    panels[1, 0].set_ylim(min(low for low, _ in scales), max(high for _, high in scales))
+    panels[0, 0].set_ylim(min(lows), max(highs))
     for axes in panels.flat:
-        _finish(axes, has_legend=axes in panels[:, -1], with_counts=len(views) == 1)
-    figure.align_ylabels()
+        axes.grid(color='#E9ECEE', linewidth=0.7)
+        axes.set_axisbelow(True)
+        axes.label_outer()
+    for axes in panels[:, -1]:
+        axes.legend(loc='upper left', bbox_to_anchor=(1.01, 1.01), frameon=False)
     save(figure, path)
-
-
-def _panels(n: int) -> tuple[Any, Any]:
-    """Return a figure and its panels, (2, n), with the same axes in each row."""
-    width = LEGEND + (PANEL if n == 1 else n * PANEL_OF_SEVERAL)
-    figure = new_figure(width, PANELS_HEIGHT, SEGMENT_DPI)
-    shared = {'sharex': True, 'sharey': 'row', 'squeeze': False}
-    panels = figure.subplots(2, n, height_ratios=(2.6, 1.0), **shared)
-    edge = 0.065 * (PANEL + LEGEND) / width
-    figure.subplots_adjust(edge, 0.075, 1.0 - LEGEND / width, 0.93, hspace=0.08, wspace=0.04)
-    return figure, panels
-
-
-def _finish(axes: Any, *, has_legend: bool, with_counts: bool) -> None:
-    """Draw the grid of a panel, and beside the last one the legend, with its counts."""
-    axes.grid(color='#E9ECEE', linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.label_outer()
-    if not has_legend:
-        return
-    handles, labels = axes.get_legend_handles_labels()
-    axes.legend(
-        handles, labels if with_counts else [label.split(' (')[0] for label in labels],
-        loc='upper left', bbox_to_anchor=(1.01, 1.01), frameon=False, fontsize=10,
-        borderaxespad=0.0, labelspacing=0.8, markerscale=1.3,
-    )  # fmt: skip
 
 
 class SegmentView:
@@ -329,8 +283,8 @@ class SegmentView:
         """Draw points over range by label, and errors on them, if the true labels are known."""
         own = None if truth is None else truth[self._inside]
         for name, chosen in label_layers(self._result.label[self._inside], own)[1].items():
-            look = {'color': COLOURS[name], 'label': f'{name} ({np.count_nonzero(chosen)})'}
-            axes.plot(self.r[chosen], self.z[chosen], 'o', ms=3.6, mew=0, zorder=2, **look)
+            look = {'color': COLOURS[name], 'label': name, 'zorder': 2}
+            axes.plot(self.r[chosen], self.z[chosen], 'o', ms=3.6, mew=0, **look)
 
     def draw_ground(self, axes: Any) -> None:
         """Draw ground, lines and candidates over range."""
@@ -339,11 +293,12 @@ class SegmentView:
         axes.fill_between(self._knots, low, high, label='surface ± 2 std', **look)
         self._draw_lines(axes)
         axes.plot(self._knots, self._mean, color=SURFACE_COLOUR, lw=1.8, zorder=5, label='surface')
-        hollow = {'mfc': 'white', 'mec': CANDIDATE_COLOUR, 'mew': 1.1, 'ms': 5.5, 'zorder': 6}
-        full = {'color': CANDIDATE_COLOUR, 'mew': 0.0, 'ms': 5.5, 'zorder': 7}
-        groups = (('rejected', ~self._inlier, hollow), ('inliers', self._inlier, full))
-        for name, chosen, look in groups:
-            label = f'candidates, {name} ({np.count_nonzero(chosen)})'
+        for name, chosen, inner in (
+            ('rejected', ~self._inlier, 'white'),
+            ('inliers', self._inlier, CANDIDATE_COLOUR),
+        ):
+            look = {'mfc': inner, 'mec': CANDIDATE_COLOUR, 'ms': 5.5, 'zorder': 7}
+            label = f'candidates, {name}'
             axes.plot(self._r[chosen], self._z[chosen], 'o', label=label, **look)
         axes.set_ylabel('height z, sensor frame [m]')
 
@@ -359,49 +314,39 @@ class SegmentView:
     def _draw_lines(self, axes: Any) -> None:
         """Draw each line over its extent, and the critical points where the next one begins."""
         candidates, lines = self._result.candidates, self._result.lines
-        drawn = [q for q in self._lines if lines.start[q + 1] - lines.start[q] > 1]
-        for q in drawn:
+        look = {'color': LINE_COLOUR, 'lw': 3.2, 'alpha': 0.75, 'zorder': 4, 'label': 'lines'}
+        share = np.linspace(0.0, 1.0, N_OF_LINE)
+        for q in self._lines:
             points = slice(lines.start[q], lines.start[q + 1])
-            r, z = candidates.r[points], candidates.z[points]
-            share = np.linspace(0.0, 1.0, N_OF_LINE)
-            r, z = (a + share * (b - a) for a, b in line_ends(r, z, float(lines.slope[q])))
-            axes.plot(
-                r, z + self._relief(r),
-                color=LINE_COLOUR, lw=3.2, alpha=0.75, solid_capstyle='butt', zorder=4,
-                label=f'lines ({len(self._lines)})' if q == drawn[0] else None,
-            )  # fmt: skip
-        critical = lines.start[self._lines[1:]]
-        first = self._result.candidates.offsets[self._segment]
+            if points.stop - points.start > 1:
+                ends = line_ends(candidates.r[points], candidates.z[points], float(lines.slope[q]))
+                r, z = (a + share * (b - a) for a, b in ends)
+                axes.plot(r, z + self._relief(r), **look)
+                look['label'] = None  # one entry in the legend for all
+        critical = lines.start[self._lines[1:]] - candidates.offsets[self._segment]
         axes.plot(
-            self._r[critical - first], self._z[critical - first], 'd', ms=9, mfc='none',
-            mec=LINE_COLOUR, mew=1.2, zorder=8, label=f'critical points ({len(critical)})',
+            self._r[critical], self._z[critical], 'd', ms=9, mfc='none', mec=LINE_COLOUR,
+            zorder=8, label='critical points',
         )  # fmt: skip
 
-    def draw_length_scale(self, axes: Any, reach: float, *, with_pseudo_inputs: bool) -> None:
-        """Draw the length-scale over range, and the pseudo-inputs it follows."""
-        from matplotlib.ticker import LogLocator, NullFormatter
+    def draw_length_scale(self, axes: Any, config: Config) -> None:
+        """Draw the length-scale over range, its limits, and the pseudo-inputs it follows."""
+        from matplotlib.ticker import LogLocator
 
         result = self._result
         length_scale = np.exp(result.log_length_scale[self._segment])
         axes.plot(self._knots, length_scale, color=SURFACE_COLOUR, lw=1.8, label='length-scale')
-        shown = length_scale[(self._knots <= reach) & np.isfinite(length_scale)]
-        first, last = result.pseudo.offsets[self._segment : self._segment + 2]
-        if with_pseudo_inputs and last > first:
-            r_bar = result.pseudo.r_bar[first:last]
-            shared = result.theta[5 + result.pseudo.kind[first:last]]
-            l_bar = np.exp(result.pseudo.log_extent[first:last] + shared)
-            look = {'ms': 5, 'color': PSEUDO_INPUT_COLOUR, 'mew': 0.0}
-            axes.plot(r_bar, l_bar, 's', label=f'pseudo-inputs ({last - first})', **look)
-            shown = np.concatenate([shown, l_bar[r_bar <= reach]])
-        # At least a decade: ripples of a constant must not look like mountains. Set before the
-        # scale, since on a log axis matplotlib warns of limits that a constant makes equal.
-        low, high = (shown.min(), shown.max()) if len(shown) else (1.0, 10.0)
-        factor = max(1.2 * math.sqrt(high / low), math.sqrt(10.0))
-        axes.set_ylim(math.sqrt(low * high) / factor, math.sqrt(low * high) * factor)
+        if config.length_scale.model == 'latent':
+            own = slice(*result.pseudo.offsets[self._segment : self._segment + 2])
+            shared = result.theta[5 + result.pseudo.kind[own]]
+            l_bar = np.exp(result.pseudo.log_extent[own] + shared)
+            look = {'ms': 5, 'color': PSEUDO_INPUT_COLOUR, 'mew': 0.0, 'label': 'pseudo-inputs'}
+            axes.plot(result.pseudo.r_bar[own], l_bar, 's', **look)
+        for limit in (config.length_scale.min, config.length_scale.max):
+            axes.axhline(limit, color=SURFACE_COLOUR, lw=0.8, ls=':')
         axes.set_yscale('log')
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter('{x:g}')
-        axes.yaxis.set_minor_formatter(NullFormatter())
         axes.set_xlabel('horizontal range r [m]')
         axes.set_ylabel('length-scale l [m]')
 

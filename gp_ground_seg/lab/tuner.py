@@ -5,7 +5,6 @@ The page is one that viser serves to this user alone.
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import html
 import io
@@ -25,7 +24,6 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.errors import (
     LOGGER,
-    ConfigError,
     DataError,
     GroundSegError,
     in_thousands,
@@ -146,24 +144,16 @@ def open_server(port: int) -> Iterator[tuple[Any, str]]:
 def _guarded(token: str) -> Iterator[None]:
     """Let the server of websockets that viser starts in the block answer only to the token.
 
-    viser has no hook for this. Hence `websockets.asyncio.server.serve`, which it calls, is another
-    one meanwhile; if a later viser does not call it, nothing is served.
+    viser has no hook for this. Hence the block replaces `websockets.asyncio.server.serve`, which
+    viser calls; if a later viser does not call it, nothing is served.
     """
     module, is_guarded = require('websockets.asyncio.server', 'viser'), False
     serve, silent = module.serve, LOGGER.getChild('websockets')
-    silent.setLevel(logging.CRITICAL)  # it logs tracebacks of connections, as errors
+    silent.setLevel(logging.CRITICAL)  # it logs a traceback for a page that sends nonsense
 
-    def ignore(error: object) -> None:
-        LOGGER.warning('the page: ignored what cannot be read (%s)', type(error).__name__)
-
-    def guarded(
-        handle: Callable[[Any], Any], host: str, port: int,
-        process_request: Callable[[Any, Any], Any], **options: Any,
-    ) -> Any:  # fmt: skip
+    def guarded(*args: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
         nonlocal is_guarded
         is_guarded = True
-        loop = asyncio.get_running_loop()
-        loop.set_exception_handler(lambda _loop, context: ignore(context.get('exception')))
 
         def process(connection: Any, request: Any) -> Any:
             if not _is_admitted(request, token):
@@ -171,14 +161,8 @@ def _guarded(token: str) -> Iterator[None]:
             path = request.path.removeprefix(f'/{token}')
             return process_request(connection, dataclasses.replace(request, path=path))
 
-        async def handle_any(connection: Any) -> None:
-            try:
-                await handle(connection)
-            except Exception as error:  # of a page that sends anything
-                ignore(error)
-
         options |= {'process_request': process, 'logger': silent}
-        return serve(handle_any, host, port, **options)
+        return serve(*args, **options)
 
     module.serve = guarded
     try:
@@ -202,11 +186,6 @@ def _is_admitted(request: Any, token: str) -> bool:
         and origins in ([], [f'http://{hosts[0]}'])
         and secrets.compare_digest(given.encode(errors='replace'), token.encode())
     )
-
-
-def text(words: object) -> str:
-    """Return HTML that shows `words` as they are: names and messages may come from a file."""
-    return html.escape(str(words))
 
 
 def box(content: str) -> str:
@@ -287,12 +266,9 @@ class Tuner:
         gui.set_panel_label(inputs.path.name)
         self._said = gui.add_html(box('segmenting ...'))
         self._table, self._legend = gui.add_markdown(''), gui.add_html('')
-        number = gui.add_slider('frame', 0, max(last, 1), 1, frame, visible=last > 0)
-        name = gui.add_dropdown('colours', COLOURINGS)
-        for handle in (number, name):
-            handle.on_update(lambda _event: self._changed.set())
-        self._frame = _reader('frame', number, {k: k for k in range(len(inputs))}.__getitem__)
-        self._colours = _reader('colours', name, {word: word for word in COLOURINGS}.__getitem__)
+        self._frame = gui.add_slider('frame', 0, max(last, 1), 1, frame, visible=last > 0)
+        self._colours = gui.add_dropdown('colours', COLOURINGS)
+        self._watch(self._frame, self._colours)
         self._controls = {name: self._add_control(find_spec(name)) for name in names}
         self.add_button('compare with these values', self._compare)
 
@@ -313,13 +289,18 @@ class Tuner:
             _tell(self._said, self._update)
 
     def _update(self) -> str:
-        self.show(self._frame(), self._colours(), self.config)
+        self.show(self._frame.value, self._colours.value, self.config)
         return ''
 
     def _compare(self, config: Config) -> str:
         self._reference = config
         self._changed.set()
         return ''
+
+    def _watch(self, *controls: Any) -> None:
+        """Have `run` segment again when one of the controls changes."""
+        for control in controls:
+            control.on_update(lambda _event: self._changed.set())
 
     def _add_control(self, spec: ParameterSpec) -> Callable[[], Any]:
         """Add the control of a parameter, and return what reads it."""
@@ -329,8 +310,8 @@ class Tuner:
             return self._add_number(spec, hint)
         words = {str(option).lower(): option for option in spec.choices or (False, True)}
         shown = gui.add_dropdown(spec.name, list(words), initial_value=str(now).lower(), hint=hint)
-        shown.on_update(lambda _event: self._changed.set())
-        return _reader(spec.name, shown, words.__getitem__)
+        self._watch(shown)
+        return lambda: words[shown.value]
 
     def _add_number(self, spec: ParameterSpec, hint: str) -> Callable[[], Any]:
         """Add a slider, and a checkbox for `AUTO` where a parameter has that."""
@@ -339,18 +320,13 @@ class Tuner:
         number = spec.type(0.5 * (low + high) if now == AUTO else now)
         title = f'{spec.name} [{spec.unit}]' if spec.unit else spec.name
         slider = gui.add_slider(title, low, high, step, number, hint=hint, disabled=now == AUTO)
-        slider.on_update(lambda _event: self._changed.set())
-        read = _reader(spec.name, slider, spec.check)
+        self._watch(slider)
         if not spec.auto:
-            return read
+            return lambda: slider.value
         automatic = gui.add_checkbox(f'{spec.name} = {AUTO}', now == AUTO)
-
-        def switch(_event: Any) -> None:
-            slider.disabled = automatic.value
-            self._changed.set()
-
-        automatic.on_update(switch)
-        return lambda: AUTO if automatic.value else read()
+        automatic.on_update(lambda _event: setattr(slider, 'disabled', automatic.value))
+        self._watch(automatic)
+        return lambda: AUTO if automatic.value else slider.value
 
     def _segment(self, number: int, config: Config) -> Segmentation:
         self._segmenter.configure(config)
@@ -392,26 +368,8 @@ def _tell(place: Any, action: Callable[[], str]) -> None:
         words = action()
     except Exception as error:
         words = str(error) if isinstance(error, GroundSegError) else repr(error)
-    place.content = box(text(words)) if words else ''
-
-
-def _reader(name: str, control: Any, choose: Callable[[Any], Any]) -> Callable[[], Any]:
-    """Return what reads a control; what the page sent and `choose` refuses is taken back."""
-    last = control.value
-
-    def read() -> Any:
-        nonlocal last
-        sent = control.value
-        try:
-            chosen = choose(sent)
-        except (KeyError, TypeError, ConfigError):
-            LOGGER.warning('%s: taken back what the page sent, %.60r', name, sent)
-            control.value = last
-            return choose(last)
-        last = sent
-        return chosen
-
-    return read
+    # Names and messages may come from a file.
+    place.content = box(html.escape(words)) if words else ''
 
 
 def _table(result: Segmentation, before: Labels, scores: Sequence[dict[str, float]]) -> str:

@@ -1,29 +1,65 @@
-"""The pictures of scans and scores, by their pixels."""
+"""The pictures of `plot`, by their pixels: scans in perspective, segments from the side."""
 
+import math
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from cli_runner import error_line, run
 from conftest import hilly_scan
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from gp_ground_seg import GroundSegmenter
-from gp_ground_seg.core.errors import DataError, MissingDependencyError, PointCloudError
+from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.parameters.config import GridConfig
+from gp_ground_seg.core.pipeline.polar_grid import build_polar_grid, grid_geometry
 from gp_ground_seg.lab import plotting
 from gp_ground_seg.lab.plotting import (
     CAMERA,
     COLOURS,
     TARGET,
     ZOOM,
+    SegmentView,
     camera_at,
     label_layers,
+    line_ends,
     plot_scan_view,
+    plot_segment,
     project,
+    segment_at,
 )
+
+SEGMENT = 90
+ROAD, BUILDING = 40, 50
+
+
+def ahead(n_points=1500, seed=0):
+    """Rising ground and a wall in a sector ahead that is narrower than a segment."""
+    rng = np.random.default_rng(seed)
+    r = rng.uniform(4.0, 30.0, n_points)
+    angle = rng.uniform(0.002, 0.033, n_points)
+    z = -1.73 + 0.02 * r + rng.normal(0.0, 0.01, n_points)
+    wall = rng.random(n_points) < 0.2
+    r[wall] = 15.0 + rng.uniform(0.0, 0.3, wall.sum())
+    z[wall] = rng.uniform(-1.4, -0.9, wall.sum())
+    points = np.column_stack([r * np.cos(angle), r * np.sin(angle), z, np.zeros(n_points)])
+    return points.astype('<f4'), wall
+
+
+@pytest.fixture(scope='module')
+def scan(tmp_path_factory):
+    """A .bin file, with labels beside it."""
+    path = tmp_path_factory.mktemp('scan') / 'scan.bin'
+    points, wall = ahead()
+    points.tofile(path)
+    semantic = np.where(wall, BUILDING, ROAD).astype('<u4')
+    semantic[np.flatnonzero(wall)[:40]] = ROAD  # missed ground
+    semantic.tofile(path.with_suffix('.label'))
+    return path
 
 
 def close_to(pixels, colour, tolerance=0.005):
@@ -94,37 +130,12 @@ def test_colours_differ_in_grey_too():
     assert grey['ground'] - max(grey['false ground'], grey['missed ground']) > 0.25
 
 
-@pytest.mark.parametrize(
-    ('keywords', 'error', 'message'),
-    [
-        ({'label': np.zeros(9, np.uint8)}, PointCloudError, r'label of shape \(9,\) for 4000'),
-        ({'truth': np.zeros(9, np.uint8)}, PointCloudError, r'truth of shape \(9,\) for 4000'),
-        ({'points': np.zeros(5)}, PointCloudError, r'\(5,\)'),
-        ({'path': '/no/such/folder/a.png'}, DataError, '/no/such/folder'),
-        ({'path': '/'}, DataError, 'not a file'),
-    ],
-)
-def test_bad_input_is_said(tmp_path, keywords, error, message):
-    good = {'points': patch(0, 0), 'label': repeat(0), 'path': tmp_path / 'a.png'}
-    with pytest.raises(error, match=message):
-        plot_scan_view(**{**good, **keywords})
+def test_values_do_not_fit_the_points(tmp_path):
+    for name in ('label', 'truth'):
+        good = {'points': patch(0, 0), 'label': repeat(0), 'path': tmp_path / 'a.png'}
+        with pytest.raises(PointCloudError, match=rf'{name} of shape \(9,\) for 4000'):
+            plot_scan_view(**{**good, name: np.zeros(9, np.uint8)})
     assert list(tmp_path.iterdir()) == []
-
-
-def test_matplotlib_is_optional_and_its_global_state_untouched(tmp_path, monkeypatch):
-    script = (
-        'import sys, numpy as np\n'
-        'from gp_ground_seg.lab.plotting import plot_scan_view\n'
-        'assert "matplotlib" not in sys.modules\n'
-        'plot_scan_view(np.zeros((2, 3)), np.ones(2, np.uint8), sys.argv[1])\n'
-        'assert "matplotlib" in sys.modules and "matplotlib.pyplot" not in sys.modules\n'
-    )
-    words = [sys.executable, '-c', script, str(tmp_path / 'a.png')]
-    subprocess.run(words, check=True, timeout=60)
-    monkeypatch.setitem(sys.modules, 'matplotlib.figure', None)
-    with pytest.raises(MissingDependencyError, match='matplotlib'):
-        plot_scan_view(np.zeros((2, 3)), np.ones(2, np.uint8), tmp_path / 'b.png')
-    assert not (tmp_path / 'b.png').exists()
 
 
 def test_camera_projects_as_a_camera_does():
@@ -143,21 +154,15 @@ def test_camera_projects_as_a_camera_does():
 
 
 def test_picture_has_its_title_above_and_its_legend_below(tmp_path):
-    points = hilly_scan(8000).astype(np.float32)
-    points[:10] = np.nan
-    label = GroundSegmenter().segment(points).label
-    for title, height in (('title with $ and _', 840), ('', 792)):
-        plot_scan_view(points, label, tmp_path / 'scan.png', title)
+    points = np.concatenate([patch(10, 8), patch(10, -8)])
+    for title, n_dark in (('title with $ and _', 300), ('', 0)):
+        plot_scan_view(points, repeat([1, 2]), tmp_path / 'scan.png', title)
         picture = imread(tmp_path / 'scan.png')
-        assert picture.shape[:2] == (height, 1440)
+        dark = (picture[:60, :, :3].max(axis=-1) < 0.3).sum()
+        assert dark > n_dark if title else dark == 0
         for name in ('ground', 'obstacle'):
-            assert close_to(picture[60:650], COLOURS[name]).sum() > 400
             # The legend is below the scene, not in it.
             assert close_to(picture[-72:, :720], COLOURS[name]).sum() > 50
-
-
-def on_screen(camera, *points):
-    return project(np.array(points, dtype=float), camera)[0]
 
 
 def test_a_camera_stands_where_it_is_told():
@@ -166,35 +171,19 @@ def test_a_camera_stands_where_it_is_told():
     up = np.degrees(np.arcsin((CAMERA[2] - TARGET[2]) / distance))
     assert (turn + 360, up, distance) == pytest.approx((196, 24, 32), abs=0.2)  # as --help says
     np.testing.assert_allclose(camera_at(turn, up, distance), CAMERA, atol=1e-9)
-    ahead, left = np.add(TARGET, (5, 0, 0)), np.add(TARGET, (0, 5, 0))
     # From the left what is ahead is to the left; from ahead what is left is to the right.
-    (x, _), (_, y) = on_screen(camera_at(90, 0, 20), ahead, np.add(TARGET, (0, 0, 1)))
-    assert x == pytest.approx(-0.25 * ZOOM) and y > 0
-    assert on_screen(camera_at(0, 10, 20), left)[0, 0] > 0.2 * ZOOM
-    assert on_screen(camera_at(0, 10, 40), left)[0, 0] < 0.2 * ZOOM
+    ahead, left = np.add(TARGET, (5, 0, 0)), np.add(TARGET, (0, 5, 0))
+    assert project(ahead, camera_at(90, 0, 20))[0][0] == pytest.approx(-0.25 * ZOOM)
+    assert project(left, camera_at(0, 10, 20))[0][0] > 0.2 * ZOOM
+    assert project(left, camera_at(0, 10, 40))[0][0] < 0.2 * ZOOM
 
 
-@pytest.fixture(scope='module')
-def drawn(tmp_path_factory):
-    """Scan of level ground with a wall, and its file."""
-    rng = np.random.default_rng(0)
-    ground = rng.uniform((-20, -20, -1.75), (30, 20, -1.71), (20000, 3))
-    wall = rng.uniform((20, -10, -1.7), (20.1, 10, 0.3), (4000, 3))
-    points = np.column_stack([np.concatenate([ground, wall]), np.zeros(24000)]).astype('<f4')
-    path = tmp_path_factory.mktemp('scans') / 'a.bin'
-    points.tofile(path)
-    return path
-
-
-def test_pdf_and_svg_hold_points_as_pixels_and_are_the_same_each_time(drawn, tmp_path):
+def test_pdf_and_svg_hold_points_as_pixels(scan, tmp_path):
     for name, begin in (('a.pdf', b'%PDF'), ('a.svg', b'<?xml')):
-        found = []
-        for _ in range(2):
-            assert run('plot', 'scan', drawn, '-o', tmp_path / name, '--force') == 0
-            found.append((tmp_path / name).read_bytes())
-        assert found[0] == found[1]
-        assert found[0].startswith(begin) and len(found[0]) < 2_000_000
-    assert found[0].count(b'<image') >= 1 and found[0].count(b'<use') < 100
+        assert run('plot', 'scan', scan, '-o', tmp_path / name) == 0
+        found = (tmp_path / name).read_bytes()
+        assert found.startswith(begin) and len(found) < 2_000_000
+    assert found.count(b'<image') >= 1 and found.count(b'<use') < 100
 
 
 @pytest.mark.parametrize('camera', ['90', '90,30', 'a,b,c', '0,90,20', '0,20,0.5', '0,20,nan'])
@@ -203,9 +192,9 @@ def test_a_camera_that_sees_nothing_is_refused(capsys, camera):
     assert 'as in 90,30,40' in error_line(capsys)
 
 
-def test_command_draws_a_scan_and_keeps_what_is_there(drawn, tmp_path, capsys):
+def test_command_draws_a_scan_and_keeps_what_is_there(scan, tmp_path, capsys):
     path = tmp_path / 'a.png'
-    words = ['plot', 'scan', drawn, '-o']
+    words = ['plot', 'scan', scan, '-o']
     assert run(*words, path) == 0
     said = r'[\d ]+ points: [\d ]+ ground, [\d ]+ obstacle, written to .*a\.png\n'
     assert re.fullmatch(said, capsys.readouterr().out)
@@ -222,36 +211,12 @@ def test_command_draws_a_scan_and_keeps_what_is_there(drawn, tmp_path, capsys):
     assert path.read_bytes() != before
 
 
-def test_command_draws_the_errors(tmp_path, capsys):
-    points = np.column_stack([hilly_scan(8000), np.zeros(8000)]).astype('<f4')
-    points.tofile(tmp_path / 'a.bin')
-    np.full(8000, 40, '<u4').tofile(tmp_path / 'a.label')
-    words = ['--labels', tmp_path / 'a.label', '-o', tmp_path / 'a.png']
-    assert run('plot', 'scan', tmp_path / 'a.bin', *words) == 0
-    said = r'0 false ground, [\d ]+ missed ground, IoU [\d.]+ %, written to'
+def test_command_draws_the_errors(scan, tmp_path, capsys):
+    words = ['--labels', scan.with_suffix('.label'), '-o', tmp_path / 'a.png']
+    assert run('plot', 'scan', scan, *words) == 0
+    said = r'\d+ false ground, [\d ]+ missed ground, IoU [\d.]+ %, written to'
     assert re.match(said, capsys.readouterr().out.splitlines()[-1])
-    assert where(tmp_path / 'a.png', COLOURS['missed ground'])[1] > 500
-
-
-DEFICIENCIES = {
-    'none': np.eye(3),
-    'protanopia': [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
-                   [-0.003882, -0.048116, 1.051998]],
-    'deuteranopia': [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
-                     [-0.011820, 0.042940, 0.968881]],
-    'tritanopia': [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602],
-                   [0.004733, 0.691367, 0.303900]],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize('name', DEFICIENCIES)
-def test_lightness_of_the_colours_rises_for_every_eye(name):
-    colours = plotting.ramp_colours(np.linspace(1.0, 50.0, 30), 1.0, 50.0)
-    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-    seen = np.clip(linear @ np.transpose(DEFICIENCIES[name]), 0.0, 1.0)
-    lightness = 116.0 * np.cbrt(seen @ [0.2126, 0.7152, 0.0722]) - 16.0
-    assert np.diff(lightness).min() > 1.0
-    assert np.ptp(lightness) > 60.0
+    assert where(tmp_path / 'a.png', COLOURS['missed ground'])[1] > 10
 
 
 def test_colours_end_at_the_limits_and_nan_is_grey():
@@ -261,3 +226,173 @@ def test_colours_end_at_the_limits_and_nan_is_grey():
     np.testing.assert_array_equal(ends[3], ends[1])
     assert not np.array_equal(ends[0], ends[1])
     np.testing.assert_array_equal(ends[4:], [plotting.UNKNOWN] * 3)
+
+
+# Segments from the side.
+
+
+@pytest.fixture
+def draw(scan, tmp_path):
+    """Draw with the command, and return the upper and the lower panel of the picture."""
+
+    def command(*words, segment=('--segment', SEGMENT), name='a.png'):
+        assert run('plot', 'segment', scan, *segment, '-o', tmp_path / name, *words) == 0
+        image = imread(tmp_path / name)[:, :, :3]
+        height, width = image.shape[:2]
+        inside = image[:, round(0.07 * width) : round(0.77 * width)]
+        rows = [round(share * height) for share in (0.05, 0.65, 0.72, 0.91)]
+        return inside[rows[0] : rows[1]], inside[rows[2] : rows[3]]
+
+    return command
+
+
+def count(pixels, colour):
+    return int(close_to(pixels, colour, 0.01).sum())
+
+
+@given(azimuth=st.floats(-10.0, 10.0), n_segments=st.integers(4, 400))
+def test_segment_at_is_that_of_the_grid(azimuth, n_segments):
+    xyz = np.array([[10.0 * math.cos(azimuth), 10.0 * math.sin(azimuth), 0.0]])
+    geometry = grid_geometry(GridConfig(n_segments=n_segments), 0.5, xyz.dtype)
+    grid = build_polar_grid(xyz, geometry)
+    # On the edge between two segments rounding decides.
+    position = (azimuth / math.tau + 0.5) * n_segments
+    if abs(position - round(position)) > 1e-9:
+        assert segment_at(azimuth, n_segments) == grid.segment[0]
+
+
+@pytest.mark.parametrize(
+    ('slope', 'ends'),
+    [
+        (1.0, [[1.0, 3.0], [5.0, 7.0]]),
+        (0.0, [[1.0, 3.0], [6.0, 6.0]]),
+        (math.inf, [[2.0, 2.0], [5.0, 7.0]]),
+        (-math.inf, [[2.0, 2.0], [7.0, 5.0]]),
+    ],
+)
+def test_line_ends_by_hand(slope, ends):
+    r, z = np.array([1.0, 2.0, 3.0]), np.array([5.0, 6.0, 7.0])
+    np.testing.assert_allclose(line_ends(r, z, slope), ends, atol=1e-12)
+
+
+def test_everything_is_drawn(draw, scan, tmp_path, capsys):
+    upper, lower = draw('--labels', scan.with_suffix('.label'))
+    drawn = [COLOURS['ground'], COLOURS['obstacle'], COLOURS['missed ground']]
+    for colour in (*drawn, plotting.CANDIDATE_COLOUR, plotting.SURFACE_COLOUR):
+        assert count(upper, colour) > 10, colour
+    assert count(lower, plotting.PSEUDO_INPUT_COLOUR) > 30
+    assert count(lower, plotting.SURFACE_COLOUR) > 300
+    result = GroundSegmenter().segment(ahead()[0])
+    first, last = result.candidates.offsets[SEGMENT : SEGMENT + 2]
+    assert capsys.readouterr().out == (
+        f'segment 90: {last - first} candidates, {result.surface.inlier[first:last].sum()} '
+        f'inliers, {np.diff(result.pseudo.offsets)[SEGMENT]} pseudo-inputs, '
+        f'written to {tmp_path / "a.png"}\n'
+    )
+
+
+def test_pseudo_inputs_only_where_they_act(draw):
+    upper, lower = draw('--set', 'length_scale.model=constant')
+    assert count(lower, plotting.PSEUDO_INPUT_COLOUR) == 0
+    assert count(lower, plotting.SURFACE_COLOUR) > 300
+    # Without labels no errors are known.
+    assert count(upper, COLOURS['ground']) > 100
+    assert count(upper, COLOURS['missed ground']) == 0
+
+
+def test_azimuth_is_another_way_to_say_segment(draw, tmp_path):
+    draw(segment=('--azimuth', 1), name='a.png')
+    draw(name='b.png')
+    assert (tmp_path / 'a.png').read_bytes() == (tmp_path / 'b.png').read_bytes()
+
+
+def test_segments_side_by_side(scan, tmp_path, capsys):
+    """The wall ahead is in the first of the two only; both have the same axes."""
+    path = tmp_path / 'pair.png'
+    assert run('plot', 'segment', scan, '--segment', f'{SEGMENT},91', '-o', path) == 0
+    said = capsys.readouterr().out
+    assert said.startswith('segment 90: ') and '; segment 91: 0 candidates' in said
+    image = imread(path)[:, :, :3]
+    left, right, _legend = np.split(image, [972, 1880], axis=1)
+    violet = plotting.PSEUDO_INPUT_COLOUR
+    assert count(left, violet) > 20 and count(right, violet) == 0
+
+
+def test_what_is_drawn_is_the_result():
+    """The curves' data, read back from the axes."""
+    points = hilly_scan().astype(np.float32)
+    result = GroundSegmenter().segment(points)
+    above, below = Figure().subplots(2)
+    view = SegmentView(result, SEGMENT, points[:, 2])
+    view.draw_ground(above)
+    view.draw_length_scale(below, Config())
+
+    drawn = {line.get_label(): line for line in above.lines}
+    inside = slice(*result.candidates.offsets[SEGMENT : SEGMENT + 2])
+    own = result.candidates.where(result.candidates.segment == SEGMENT)
+    r, z = own.r, own.z + result.relief.at(own.x, own.y)
+    inlier = result.surface.inlier[inside]
+    begins = np.flatnonzero(np.diff(result.lines.line[inside])) + 1
+    assert len(begins) > 0
+    np.testing.assert_array_equal(drawn['critical points'].get_xdata(), r[begins])
+    np.testing.assert_array_equal(drawn['candidates, inliers'].get_ydata(), z[inlier])
+    knots, n_segments = result.surface.knots, result.grid.n_segments
+    surface = result.surface.mean + result.relief.at_knots(knots, n_segments)
+    assert not result.relief.is_level
+    np.testing.assert_array_equal(drawn['surface'].get_ydata(), surface[SEGMENT])
+    # A line over the relief ends where its first and its last candidate are, nearly.
+    lines = [line for line in above.lines if len(line.get_xdata()) == 16]
+    assert len(lines) > 1
+    for line in lines:
+        ends = np.interp(line.get_xdata()[[0, -1]], r, z)
+        np.testing.assert_allclose(line.get_ydata()[[0, -1]], ends, atol=0.15)
+
+    length_scale, pseudo, *_ = below.lines
+    np.testing.assert_array_equal(
+        length_scale.get_ydata(), np.exp(result.log_length_scale[SEGMENT])
+    )
+    first, last = result.pseudo.offsets[SEGMENT : SEGMENT + 2]
+    np.testing.assert_array_equal(pseudo.get_xdata(), result.pseudo.r_bar[first:last])
+    values = np.exp(result.pseudo.log_extent[first:last])
+    values *= result.fit.theta['length_scale_factor']  # one for all
+    np.testing.assert_allclose(pseudo.get_ydata(), values)
+    # The curve follows the pseudo-inputs: it stays among them and near each.
+    at_pseudo = np.interp(pseudo.get_xdata(), length_scale.get_xdata(), length_scale.get_ydata())
+    off = np.abs(np.log(at_pseudo / values))
+    assert off.mean() < 0.5 and off.max() < 1.0
+
+
+@pytest.mark.parametrize('points', [np.full((3, 4), np.nan), np.array([[5.0, 0.1, 4.0]])])
+def test_segments_with_nothing_to_see(tmp_path, points):
+    result, path = GroundSegmenter().segment(points), tmp_path / 'a.png'
+    for truth in (result.label, None):
+        plot_segment(result, Config(), points, [SEGMENT], path, truth, title=r'$\none _ %')
+        assert imread(path).ndim == 3
+
+
+@pytest.mark.parametrize(
+    ('words', 'message'),
+    [
+        (['--segment', '180'], 'segment 180: must be in [0, 179]'),
+        (['--segment', '-1'], 'segment -1'),
+        (['--segment', '90;91'], '90;91'),
+        (['--azimuth', 'nan'], 'number of degrees'),
+        (['--azimuth', '400'], '--azimuth: 400: must be a number of degrees, -360'),
+        (['--segment', '1', '--labels', '/no.label'], '/no.label'),
+        ([], '--segment'),
+        (['--segment', '1', '--azimuth', '1'], '--azimuth'),
+    ],
+)
+def test_errors_are_said(scan, tmp_path, monkeypatch, capsys, words, message):
+    monkeypatch.chdir(tmp_path)
+    # The height is given, as this scan does not show it.
+    assert run('plot', 'segment', scan, '-o', 'a.png', '--set', 'sensor.height=1.73', *words) == 2
+    assert message in error_line(capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_shapes_have_to_fit(tmp_path):
+    points = ahead()[0]
+    result = GroundSegmenter().segment(points)
+    with pytest.raises(PointCloudError, match=r'result of shape \(1500,\) for 9 points'):
+        plot_segment(result, Config(), points[:9], [0], tmp_path / 'a.png')

@@ -50,7 +50,6 @@ class SensorModel:
     # Where the rays start in a cloud with the axes of the vehicle [m]; None: the cloud is in
     # the frame of the sensor itself.
     origin: tuple[float, float, float] | None = None
-    sector: float = 2.0 * math.pi  # of azimuths in one turn, its middle straight ahead [rad]
     others: tuple[SensorModel, ...] = ()  # merged into the same cloud; each has an `origin`
 
     @property
@@ -62,12 +61,9 @@ class SensorModel:
         """Return the unit vectors of all rays in the sensor frame, (R, 3).
 
         Ring by ring from the highest beam down; within a ring counter-clockwise from the
-        azimuth `phase` [rad], 0 = straight ahead, as in KITTI's files, or the right end of the
-        sector.
+        azimuth `phase` [rad], 0 = straight ahead, as in KITTI's files.
         """
-        turn = phase + np.arange(self.n_columns) * (self.sector / self.n_columns)
-        if self.sector < 2.0 * math.pi:
-            turn -= 0.5 * self.sector
+        turn = phase + np.arange(self.n_columns) * (2.0 * math.pi / self.n_columns)
         azimuth, elevation = np.broadcast_arrays(turn, np.asarray(self.elevations)[:, None])
         flat = np.cos(elevation)
         rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1)
@@ -127,19 +123,11 @@ VLP_32C = SensorModel(
 )  # fmt: skip
 # As on Argoverse 2's cars: the frame of the cloud is on the ground below the rear axle.
 _UPSIDE_DOWN = replace(VLP_32C, height=1.6, roll=math.pi, origin=(1.35, 0.0, 1.6))
-# 128 beams of 0.1 degrees in a sector ahead.
-AT128 = SensorModel(
-    'at128', _beams((12.5, -12.9, 128)), 1200, 1.0, 200.0, 0.02, 1.9,
-    sector=math.radians(120.0),
-)  # fmt: skip
 # A Pandar64's beams are densest about the horizon.
 PANDAR64 = replace(
     HDL_64E, name='pandar64', n_columns=1800, height=2.06,
     elevations=_beams((15.0, 3.0, 5), (2.0, -6.0, 49), (-7.0, -14.0, 8), (-19.0, -25.0, 2)),
 )  # fmt: skip
-QT64 = SensorModel('qt64-tilted', _beams((52.1, -52.1, 64)), 600, 0.2, 60.0, 0.02, 1.2)
-
-
 SENSORS = {
     sensor.name: sensor
     for sensor in (
@@ -149,8 +137,6 @@ SENSORS = {
         replace(VLP_32C, name='vlp-32c-pair', origin=(1.35, 0.0, 1.9), others=(_UPSIDE_DOWN,)),
         replace(VLP_32C, name='vlp-32c-31', elevations=VLP_32C.elevations[:-1]),
         PANDAR64,
-        AT128,
-        replace(QT64, roll=math.radians(35.0), pitch=math.radians(10.0)),
         replace(VLP_16, name='vlp-16-low', height=0.15, min_range=0.1),
     )
 }  # fmt: skip
@@ -228,7 +214,7 @@ def _cast(
 
     `position` is of the cloud's frame, `vehicle` turns vectors of the vehicle into the world's.
     """
-    beams = sensor.directions(rng.uniform(0.0, sensor.sector / sensor.n_columns))
+    beams = sensor.directions(rng.uniform(0.0, 2.0 * math.pi / sensor.n_columns))
     n_rays = len(beams)
     mirror_draw, drop_draw = rng.random(n_rays), rng.random(n_rays)
     range_noise, intensity_noise = rng.standard_normal(n_rays), rng.standard_normal(n_rays)

@@ -34,7 +34,7 @@ CARS = ('saloon', 'hatchback', 'suv')
 MIXED = (*CARS, *CARS, 'van', 'van', 'truck')
 """Models of vehicles, among which the parked and the waiting ones are drawn."""
 LOW_DISTANCE, LOW_GAP = (3.0, 20.0), 0.03
-"""Distance of the nearest corner of a low thing [m], and angle between neighbours [rad]."""
+"""Distance of the nearest corner of a low object [m], and angle between neighbours [rad]."""
 N_OF_EACH, APART = 4, 5.5
 """Cars, persons, crates, poles and walls around a vehicle, and least distance of two [m]."""
 CRATES = 0.4, 0.65
@@ -271,29 +271,6 @@ def _blind_slope(seed: int) -> Scene:
     return Scene('blind_slope', terrain, _scattered(terrain, rng))
 
 
-def _hedge(seed: int) -> Scene:
-    """Path between dense hedges 0.5 to 0.8 m high, with a fence behind one of them."""
-    rng = np.random.default_rng(seed)
-    terrain = rough(rng, 0.02, (1.5, 10.0))
-    solids: list[Solid] = []
-    side = rng.choice([-1.0, 1.0])
-    for y in (side * rng.uniform(3.0, 6.0), -side * rng.uniform(3.0, 6.0)):
-        high, deep = rng.uniform(0.55, 0.75), rng.uniform(0.6, 1.2)
-        for x in np.arange(-30.0, 50.0, 0.25).tolist():
-            # Leaves stick out by some centimetres.
-            size = (0.27, deep + rng.uniform(-0.15, 0.15), high + rng.uniform(-0.05, 0.05))
-            at = x, y + rng.uniform(-0.05, 0.05)
-            solids.append(objects.standing_box(terrain, *at, size, kind=Kind.VEGETATION))
-    fence = side * rng.uniform(8.0, 10.0)
-    for x in np.arange(-40.0, 60.0, 2.0).tolist():
-        solids.append(objects.pole(terrain, x, fence, 1.3, 0.05))
-        for clearance in (0.52, 0.82, 1.12):
-            rail = objects.floating_box(terrain, x + 1.0, fence, (2.0, 0.04, 0.12), clearance)
-            solids.append(rail)
-    solids += traffic.person(terrain, rng.uniform(5.0, 15.0), rng.uniform(-1.0, 1.0))
-    return Scene('hedge', terrain, tuple(solids))
-
-
 def _around(
     smooth: Terrain,
     terrain: Terrain,
@@ -401,37 +378,28 @@ def _low_box(rng: np.random.Generator) -> tuple[Kind, objects.Size]:
     return Kind.BOX, (length, width, float(rng.choice(LOW_HEIGHTS)))
 
 
-def _low_wall(rng: np.random.Generator) -> tuple[Kind, objects.Size]:
-    """Wall of 12 m, 0.25 to 0.4 m high."""
-    return Kind.WALL, (12.0, objects.WALL_THICKNESS, rng.uniform(0.25, 0.4))
-
-
 def _lying_person(rng: np.random.Generator) -> tuple[Kind, objects.Size]:
     """Person who lies on the ground."""
     return Kind.PERSON, (1.7, 0.45, 0.22)
 
 
-_LOW_THINGS: dict[str, tuple[Callable[[np.random.Generator], tuple[Kind, objects.Size]], str]] = {
+_LOW_OBJECTS: dict[str, tuple[Callable[[np.random.Generator], tuple[Kind, objects.Size]], str]] = {
     'low_boxes': (_low_box, 'flat'),
     'low_boxes_rough': (_low_box, 'rough'),
-    'low_walls': (_low_wall, 'flat'),
     'lying_persons': (_lying_person, 'flat'),
 }
 
 
 def _low_scene(name: str, seed: int) -> Scene:
-    """Low things all around the sensor, each an object in plain view.
-
-    A wall is across its direction, all else is turned at random.
-    """
+    """Low objects all around the sensor, turned at random, each in plain view."""
     rng = np.random.default_rng(seed)
-    make, ground = _LOW_THINGS[name]
+    make, ground = _LOW_OBJECTS[name]
     terrain = _OPEN_COUNTRY[ground](rng)
     solids: list[Solid] = []
     start = bearing = rng.uniform(-math.pi, math.pi)
     while True:
         kind, (length, width, height) = make(rng)
-        turned = rng.uniform(-1.0, 1.0) * (0.3 if kind == Kind.WALL else 0.5 * math.pi)
+        turned = rng.uniform(-1.0, 1.0) * (0.5 * math.pi)
         cos, sin, near = math.cos(turned), abs(math.sin(turned)), rng.uniform(*LOW_DISTANCE)
         half = math.atan2(0.5 * (length * cos + width * sin), near)
         if bearing + 2.0 * half + LOW_GAP > start + 2.0 * math.pi:
@@ -448,29 +416,21 @@ DRIVES: dict[str, Callable[[int], Scene]] = {
     **{name: functools.partial(_open_scene, name) for name in _OPEN_COUNTRY},
     'urban': _urban,
 }
-"""Builders of the scenes whose lane along x is free: seed -> scene."""
-LOW: dict[str, Callable[[int], Scene]] = {
-    name: functools.partial(_low_scene, name) for name in _LOW_THINGS
-}
-"""Builders of the scenes of low things, around a sensor at the origin."""
-STEEP: dict[str, Callable[[int], Scene]] = {
-    'hills': _hills,
-    'valley': _valley,
-    'bank': _bank,
-    'on_ramp': _on_ramp,
-    'dike': _dike,
-}
-"""Builders of the scenes of steep ground, around a sensor at the origin."""
-PLACES: dict[str, Callable[[int], Scene]] = {
+"""Scenes whose lane along x is free, by name: seed -> scene."""
+_CROWDED = {
     'traffic_jam': _traffic_jam,
     'car_park': _car_park,
     'hidden_climb': _hidden_climb,
     'wet_road': _wet_road,
     'blind_slope': _blind_slope,
-    'hedge': _hedge,
-    **LOW,
-    **STEEP,
 }
-"""Builders of the scenes around a sensor at the origin."""
+LOW: dict[str, Callable[[int], Scene]] = {
+    name: functools.partial(_low_scene, name) for name in _LOW_OBJECTS
+}
+"""Scenes of low objects."""
+STEEP = {'hills': _hills, 'valley': _valley, 'bank': _bank, 'on_ramp': _on_ramp, 'dike': _dike}
+"""Scenes of steep ground."""
+PLACES = {**_CROWDED, **LOW, **STEEP}
+"""All scenes around a sensor at the origin."""
 SCENES = {**DRIVES, **PLACES}
-"""Builders of the named scenes: seed -> scene."""
+"""All scenes by name."""
