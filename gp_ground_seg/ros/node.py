@@ -127,9 +127,7 @@ class GroundSegmentationNode(ConfiguredNode):
                 text = f'on {self._input.topic}, {kept_height(result.pose)}'
                 self.get_logger().warning(text, **THROTTLED)
             segmented = time.monotonic()
-            topics = self._outputs.publish(
-                SegmentedCloud(cloud, result, self.config, frames.output)
-            )
+            topics = self._outputs.publish(SegmentedCloud(cloud, result, self.config, points))
         except Exception as error:
             # The next cloud may be good.
             self._refuse(cloud, error)
@@ -200,8 +198,7 @@ class GroundSegmentationNode(ConfiguredNode):
     def _follow_frames(self, config: Config) -> None:
         """Listen to TF and IMU while the parameters ask for it; clouds wait for them then."""
         before = self._frames.config if self._frames else Config()
-        is_same = (config.frame, config.output.frame) == (before.frame, before.output.frame)
-        if self._frames is not None and not is_same:
+        if self._frames is not None and config.frame != before.frame:
             self._frames.close()
             self._frames = None
         if self._frames is None and is_listening(config):

@@ -1,6 +1,5 @@
 """The topics: every byte of a cloud, and the optional ones, which cost nothing unasked."""
 
-import dataclasses
 from array import array
 
 import numpy as np
@@ -14,7 +13,7 @@ from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.core.pipeline.points import single_precision
 from gp_ground_seg.data import costmap
-from gp_ground_seg.data.costmap import Placement, SegmentedCloud
+from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_columns, read_xyz
 from gp_ground_seg.ros import outputs
 from gp_ground_seg.ros.ground_model import read_ground_model
@@ -126,8 +125,6 @@ def test_scan_is_what_a_costmap_takes(b, reduced):
     )
     np.testing.assert_array_equal(ranges, costmap.scan_ranges(*places))
     assert found.range_min == 0.0 and found.range_max == 80.0
-    placement = Placement(np.eye(3), np.array([3.0, 4.0, 5.0]))
-    assert outputs.scan(dataclasses.replace(expected, placement=placement)).range_max == 85.0
     assert len(ranges) * found.angle_increment == pytest.approx(2.0 * np.pi)
     # As laser_geometry places them: each on an obstacle of its direction.
     hit = np.isfinite(ranges)

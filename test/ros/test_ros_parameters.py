@@ -216,8 +216,7 @@ def dump(b):
 @given(config=configs(), order=st.permutations(NAMES))
 def test_any_configuration_can_be_loaded_over_any_other_in_any_order(shared, config, order):
     # TF may not be installed.
-    plain = {'frame.level': 'sensor', 'frame.sensor': 'none', 'output.frame': 'none'}
-    plain['runtime.backend'] = 'auto'
+    plain = {'frame.level': 'sensor', 'frame.sensor': 'none', 'runtime.backend': 'auto'}
     config = config.replace(**plain)
     values = {name: config[name] for name in order}
     assert all(result.successful for result in shared.load(values))
