@@ -34,8 +34,8 @@ from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg.core.backend import choose_backend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
+from gp_ground_seg.ros.loader import CHANGED, FOLLOWS
 from gp_ground_seg.ros.node import GroundSegmentationNode, main
-from gp_ground_seg.ros.start_stop import CHANGED, FOLLOWS
 
 # Other tests run beside this one, also as workers of pytest-xdist; nothing of them must be heard.
 _WORKER = os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw')

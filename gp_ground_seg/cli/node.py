@@ -9,7 +9,7 @@ import time
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import GroundSegError, MissingDependencyError, install_hint, shown
-from gp_ground_seg.ros.start_stop import run_node
+from gp_ground_seg.ros.node_process import run_node
 
 NODE_EXAMPLES = """\
   gp-ground-seg node

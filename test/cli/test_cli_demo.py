@@ -20,7 +20,7 @@ from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.data.bags import BagReader, decode_cloud
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
-from gp_ground_seg.ros import start_stop
+from gp_ground_seg.ros import loader, session
 from gp_ground_seg.ros.node_process import NodeProcess, private_session
 
 
@@ -152,22 +152,22 @@ def test_a_node_that_ends_is_said_and_one_that_runs_ends_with_its_block(rclpy, t
         assert is_running(node.pid)
         raise ZeroDivisionError
     assert not is_running(node.pid)
-    for text in ('', start_stop.FOLLOWS, start_stop.STAYS, start_stop.CHANGED):
+    for text in ('', loader.FOLLOWS, loader.STAYS, loader.CHANGED):
         log.write_text(text)
-        assert node.is_compiled() == (text == start_stop.CHANGED)
+        assert node.is_compiled() == (text == loader.CHANGED)
 
 
 @pytest.fixture
 def no_profile(monkeypatch):
     """A machine with plenty of shared memory, where the user has chosen no transport."""
-    for name in start_stop._TRANSPORT_VARIABLES:
+    for name in session._TRANSPORT_VARIABLES:
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(start_stop, '_free_shared_memory', lambda: 1 << 30)
+    monkeypatch.setattr(session, '_free_shared_memory', lambda: 1 << 30)
 
 
 def profile_in_use():
     before = dict(os.environ)
-    with start_stop.large_cloud_transport():
+    with session.large_cloud_transport():
         (found,) = {*os.environ.items()} - {*before.items()} or {(None, None)}
     assert dict(os.environ) == before
     return found[1]
@@ -176,8 +176,8 @@ def profile_in_use():
 def test_profile_of_a_checkout_and_of_an_installation(no_profile, monkeypatch, tmp_path):
     shipped = Path(__file__).parents[2] / 'config' / 'fastdds_large_clouds.xml'
     assert Path(profile_in_use()) == shipped
-    module = tmp_path / 'lib/python3.12/site-packages/gp_ground_seg/ros/start_stop.py'
-    monkeypatch.setattr(start_stop, '__file__', str(module))
+    module = tmp_path / 'lib/python3.12/site-packages/gp_ground_seg/ros/session.py'
+    monkeypatch.setattr(session, '__file__', str(module))
     assert profile_in_use() is None
     installed = tmp_path / 'share/gp_ground_seg/config/fastdds_large_clouds.xml'
     installed.parent.mkdir(parents=True)
@@ -185,18 +185,18 @@ def test_profile_of_a_checkout_and_of_an_installation(no_profile, monkeypatch, t
     assert Path(profile_in_use()) == installed
 
 
-@pytest.mark.parametrize('name', start_stop._TRANSPORT_VARIABLES)
+@pytest.mark.parametrize('name', session._TRANSPORT_VARIABLES)
 def test_no_profile_where_the_user_chose_or_shared_memory_is_short(no_profile, monkeypatch, name):
     with monkeypatch.context() as patched:
         patched.setenv(name, 'mine')
         assert profile_in_use() is None
-    monkeypatch.setattr(start_stop, '_free_shared_memory', lambda: 64 << 20)
+    monkeypatch.setattr(session, '_free_shared_memory', lambda: 64 << 20)
     assert profile_in_use() is None
 
 
 def test_each_session_has_a_namespace_of_its_own(rclpy):
     names = []
     for _ in range(2):
-        with private_session('link') as (session, _):
-            names.append(session.node.get_namespace())
+        with private_session('link') as (link, _):
+            names.append(link.node.get_namespace())
     assert names[0] != names[1] and '/' not in names

@@ -14,8 +14,8 @@ from ros_helpers import street, to_message
 from gp_ground_seg import Config
 from gp_ground_seg.core import jit, segmenter
 from gp_ground_seg.core.jit import HAVE_NUMBA, code_folder
-from gp_ground_seg.ros import start_stop
-from gp_ground_seg.ros.start_stop import CHANGED, FOLLOWS, STAYS, BackendLoader, child_command
+from gp_ground_seg.ros import loader
+from gp_ground_seg.ros.loader import CHANGED, FOLLOWS, STAYS, BackendLoader, child_command
 
 pytestmark = pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
 
@@ -99,7 +99,7 @@ def test_numpy_asked_for_meanwhile_stays(b, held_back):
 
 def test_a_failure_is_a_warning_and_the_node_goes_on(monkeypatch, tmp_path):
     monkeypatch.setattr(jit, 'is_code_kept', lambda: False)
-    monkeypatch.setattr(start_stop, '_COMPILE', "raise OSError('no space left')")
+    monkeypatch.setattr(loader, '_COMPILE', "raise OSError('no space left')")
     with ros.stderr_in(tmp_path) as stderr, ros.bench(settled=False) as b:
         assert 'OSError: no space left' in ros.said_by(stderr, STAYS)
         b.segment(to_message(street(1000)))
@@ -108,14 +108,14 @@ def test_a_failure_is_a_warning_and_the_node_goes_on(monkeypatch, tmp_path):
 
 def test_loader_that_is_closed_calls_nobody_and_frees_its_backend(held_back):
     calls = []
-    loader = BackendLoader(lambda: calls.append(1))
-    loader.start(Config())
-    assert loader.is_busy
-    loader.stop()
+    made = BackendLoader(lambda: calls.append(1))
+    made.start(Config())
+    assert made.is_busy
+    made.stop()
     held_back.set()
-    loader.close()
-    assert calls == [] and not loader.is_busy
-    assert loader.take_backend() is None
+    made.close()
+    assert calls == [] and not made.is_busy
+    assert made.take_backend() is None
 
 
 def test_a_child_imports_nothing_from_relative_folders(monkeypatch):

@@ -17,7 +17,7 @@ from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.config import PRESETS, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.removed import REMOVED
-from gp_ground_seg.ros.start_stop import CHANGED
+from gp_ground_seg.ros.loader import CHANGED
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 

@@ -15,7 +15,8 @@ from conftest import REPOSITORY
 from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 
 from gp_ground_seg.core.jit import HAVE_NUMBA
-from gp_ground_seg.ros.start_stop import ROS_WHEELS, ros_session, stop_on_signals, unused_files
+from gp_ground_seg.ros.arguments import unused_files
+from gp_ground_seg.ros.session import ROS_WHEELS, ros_session, stop_on_signals
 
 FIXED = (*IN_NAMESPACE, '-p', 'learning.mode:=fixed')
 SOON = 4.0
