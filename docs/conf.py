@@ -32,7 +32,6 @@ napoleon_google_docstring = False
 napoleon_use_ivar = True
 
 HELP = re.compile(r'^<!-- help: (.*) -->$', re.MULTILINE)
-REMOVED_MARK = '<!-- removed -->\n'
 
 
 def help_of(words):
@@ -46,22 +45,9 @@ def help_of(words):
     return printed.getvalue()
 
 
-def removed_names():
-    """Return a table of the names that are gone, those with the same advice in one row."""
-    from gp_ground_seg.core.parameters.removed import REMOVED
-
-    names = {}
-    for name, instead in REMOVED.items():
-        names.setdefault(instead, []).append(f'`{name}`')
-    rows = (f'| {", ".join(own)} | {instead} |\n' for instead, own in names.items())
-    return '| Removed | Instead |\n| --- | --- |\n' + ''.join(rows)
-
-
 def insert_code(_app, _page, source):
-    """Put what the code says where a page has a comment for it: docs/cli.md, parameters.md."""
+    """Put what the code says where a page has a comment for it: docs/cli.md."""
     source[0] = HELP.sub(lambda found: f'```text\n{help_of(found[1].split())}```', source[0])
-    if REMOVED_MARK in source[0]:
-        source[0] = source[0].replace(REMOVED_MARK, removed_names())
 
 
 def setup(app):

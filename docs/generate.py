@@ -26,15 +26,6 @@ ALL_PARAMETERS = """
 :language: yaml
 ```
 """
-REMOVED_NAMES = """
-## Removed
-
-A command, a parameter file, the node or the launch file that is given a removed name says what to
-use instead; a subscriber of a removed topic gets no message. The HTML version of this page has the
-table of all names, of [removed.py](../gp_ground_seg/core/parameters/removed.py).
-
-<!-- removed -->
-"""
 
 
 def to_markdown_table() -> str:
@@ -118,8 +109,7 @@ def generated_files(readme: str) -> dict[str, str]:
         for preset in PRESETS.values()
     }
     files[README] = with_table(readme, SCORES, to_scores_table())
-    page = PAGE_HEAD + to_markdown_table() + ALL_PARAMETERS + REMOVED_NAMES
-    files['docs/parameters.md'] = page
+    files['docs/parameters.md'] = PAGE_HEAD + to_markdown_table() + ALL_PARAMETERS
     return files
 
 

@@ -21,8 +21,6 @@ from launch.actions import (
 )
 from launch_ros.actions import Node
 
-from gp_ground_seg.core.parameters.removed import LAUNCH_FILE, removal
-
 SHARE = Path(get_package_share_directory('gp_ground_seg'))
 NODE = 'ground_segmentation_node'
 OUTPUTS = ('ground', 'obstacles')
@@ -98,13 +96,10 @@ def _rviz(values, place):
 
 def _actions(context):
     values = context.launch_configurations
-    # Said, not refused: a launch file around this one may have the name for itself.
-    gone = [removal(f'{LAUNCH_FILE} {name}') for name, value in values.items() if value]
     # A launch file around this one may have pushed a namespace.
     parts = values.get('ros_namespace', ''), values['namespace']
     place = [part for text in parts for part in text.split('/') if part]
     actions = [
-        *(LogInfo(msg=line) for line in gone if line),
         Node(
             package='gp_ground_seg',
             executable=NODE,

@@ -19,7 +19,6 @@ from typing import Any, NoReturn, TextIO
 
 from gp_ground_seg import __version__
 from gp_ground_seg.core.errors import GroundSegError, in_one_line, reason_of, shown
-from gp_ground_seg.core.parameters.removed import removal_of_words
 from gp_ground_seg.core.parameters.schema import did_you_mean
 
 ROS_ARGS = '--ros-args'
@@ -163,8 +162,6 @@ def _parse(words: list[str]) -> argparse.Namespace:
     """Parse the words before ``--ros-args``; it and what follows is ROS's to read."""
     n_before = words.index(ROS_ARGS) if ROS_ARGS in words else len(words)
     command = next((word for word in words[:n_before] if not word.startswith('-')), None)
-    if removed := removal_of_words(words[:n_before]):
-        raise GroundSegError(removed)
     if command not in (None, *COMMANDS):
         hint = did_you_mean(command or '', COMMANDS) or '; --help lists them'
         raise GroundSegError(f'{command}: no such command{hint}')

@@ -16,7 +16,6 @@ from rclpy.qos import qos_profile_parameters
 
 from gp_ground_seg.core.errors import ConfigError, GroundSegError
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.core.parameters.removed import removal
 from gp_ground_seg.core.parameters.schema import OF_EVERY_NODE, ParameterSpec
 from gp_ground_seg.ros.arguments import start_errors
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
@@ -90,9 +89,7 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         if not isinstance(use_sim_time, bool):
             raise ConfigError(f'use_sim_time = {use_sim_time!r}: must be true or false')
         check_overrides({name: parameter.value for name, parameter in given.items()})
-        # What is removed is left out for one release, see `warn_of_unused_parameters`.
-        kept = [p for p in given.values() if not removal(p.name, p.value)]
-        self._config = changed(Config(), kept)
+        self._config = changed(Config(), given.values())
         self.check_config(self._config)
         for parameter_name in given:
             self.undeclare_parameter(parameter_name)
@@ -124,13 +121,11 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         """Use `config`, which `check_config` has accepted, from now on."""
 
     def warn_of_unused_parameters(self) -> None:
-        """Log what was given and is removed or not declared; call it after all topics are made."""
-        for name, parameter in sorted(self._given.items()):
-            reason = removal(name, parameter.value)
-            if not (reason or self.has_parameter(name)):
+        """Log what was given and is not declared; call it after all topics are made."""
+        for name in sorted(self._given):
+            if not self.has_parameter(name):
                 is_qos = name.startswith(QOS_OVERRIDES)
                 reason = 'no such topic or policy here' if is_qos else _unknown(name)
-            if reason:
                 self.get_logger().warning(f'parameter {name} is not used: {reason}')
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> Result:

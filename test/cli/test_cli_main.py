@@ -16,7 +16,6 @@ from gp_ground_seg.cli import main as cli
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.experiment import EXPERIMENTS
 from gp_ground_seg.cli.options import library_notes
-from gp_ground_seg.core.parameters.removed import PROGRAM, REMOVED
 from gp_ground_seg.lab.simulation import SCENES
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
@@ -84,40 +83,6 @@ def test_wrong_words_are_one_line_with_the_next_step(line, said, capsys):
     assert cli.main(line.split()) == 2
     said = re.sub(r'{help( ?[^}]*)}', r'gp-ground-seg\1 --help lists what it takes', said)
     assert error_line(capsys) == re.sub(r'{near ([^}]*)}', r'did you mean \1?', said)
-
-
-@pytest.mark.parametrize('name', [name for name in REMOVED if name.startswith(PROGRAM)])
-def test_a_removed_command_or_option_says_what_to_use_instead(name, capsys):
-    first, *words = name.split()[1:]
-    if first.startswith('-'):
-        first, words = 'segment', [first]
-    is_option = bool(words) and words[-1].startswith('-')
-    for given in ([*words, 'a.bin'], [*words[:-1], f'{words[-1]}=3'] if is_option else words):
-        assert cli.main([first, *given]) == 2
-        line = error_line(capsys)
-        assert line == f'{name} was removed: {REMOVED[name]}'
-    for command in re.findall(r'gp-ground-seg ([\w-]+)', REMOVED[name]):
-        assert command in cli.COMMANDS
-
-
-@pytest.mark.parametrize(
-    'line',
-    [
-        'segment s3://bucket/kitti -o out',
-        'segment a.bin -o gs://bucket/a.label',
-        'evaluate HTTPS://host/kitti --scheduler tcp://127.0.0.1:1',
-        'plot scan file:///a.bin',
-        'segment a.bin -os3://bucket/a.label',
-        'segment a.bin -o=s3://bucket/a.label',
-        'segment a.bin --output=s3://bucket/a.label --scheduler=tcp://127.0.0.1:1',
-        'segment a.bin --config=https://host/a=1.yaml',
-    ],
-)
-def test_a_url_is_refused_with_what_to_use_instead(line, capsys):
-    assert cli.main(line.split()) == 2
-    (url,) = re.findall(r'(?:^| |=|-o)((?!tcp)\w+://\S+)', line)
-    said = 'no URLs; mount the folder (s3fs, rclone), or download the file'
-    assert error_line(capsys) == f'{url}: {said}'
 
 
 def parsers_below(parser):

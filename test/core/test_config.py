@@ -10,7 +10,6 @@ from array import array
 
 import numpy as np
 import pytest
-from cli_runner import error_line, run
 from config_samples import accepted_values, configs
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,7 +18,6 @@ from gp_ground_seg import Config, ConfigError, GroundSegError
 from gp_ground_seg.cli.options import parse_setting
 from gp_ground_seg.core.parameters import number_tuples
 from gp_ground_seg.core.parameters.config import find_spec, parameter_specs
-from gp_ground_seg.core.parameters.removed import REMOVED
 
 SPECS = parameter_specs()
 NUMBERS = [spec for spec in SPECS if spec.type in (int, float)]
@@ -175,28 +173,6 @@ def test_unknown_names_come_with_the_nearest(name, hint):
         find_spec('qqqqqq')
     with pytest.raises(ConfigError, match=r"'label' is a group of parameters: label\.rule"):
         Config().replace(label=0.2)
-
-
-@pytest.mark.parametrize('key', [key for key in REMOVED if re.match(r'\w+\.\w+(=|$)', key)])
-def test_what_is_removed_comes_with_what_to_use_instead(key, tmp_path, capsys):
-    name, _, value = key.partition('=')
-    group, field = name.split('.')
-    path = tmp_path / 'old.yaml'
-    path.write_text(f'/**: {{ros__parameters: {{{group}: {{{field}: {value or 1}}}}}}}\n')
-    line = f'{key} was removed: {REMOVED[key]}'
-    for read in (lambda: Config().replace(**{name: value or 1}), lambda: Config.from_yaml(path)):
-        with pytest.raises(ConfigError, match=re.escape(line) + '$'):
-            read()
-    assert Config.problems_of_file(path) == [line]
-    for words in (['--set', f'{name}={value or 1}'], ['--config', path]):
-        assert run('config', 'dump', *words) == 2
-        assert error_line(capsys).endswith(line)
-    if value:
-        assert value not in find_spec(name).choices
-        with pytest.raises(ConfigError, match=re.escape(line)):
-            Config(**{group: dataclasses.replace(getattr(Config(), group), **{field: value})})
-    else:
-        assert name not in Config().flat()
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from gp_ground_seg import Config, ConfigError
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import PRESETS, find_preset, parameter_specs
-from gp_ground_seg.core.parameters.removed import REMOVED
 
 GENERATE = 'run: make generate'
 generate = load_script('docs/generate.py')
@@ -86,19 +85,14 @@ def test_the_table_has_a_row_for_each_parameter_that_people_set():
         assert cells[3] == spec.description + f' (`{spec.symbol}`)' * bool(spec.symbol)
 
 
-def test_the_page_of_parameters_has_its_table_all_parameters_and_what_is_gone():
+def test_the_page_of_parameters_has_its_table_and_all_parameters():
     files = generate.generated_files(''.join(generate.marks_of(generate.SCORES)))
     source = [files['docs/parameters.md']]
     load_script('docs/conf.py').insert_code(None, 'parameters', source)
-    page, _, removed = source[0].partition('\n## Removed\n')
-    table, _, listing = page.partition(generate.ALL_PARAMETERS)
+    table, _, listing = source[0].partition(generate.ALL_PARAMETERS)
     assert table.endswith(generate.to_markdown_table()) and listing == ''
-    (path,) = re.findall('^```{literalinclude} (.*)$', page, re.MULTILINE)
+    (path,) = re.findall('^```{literalinclude} (.*)$', source[0], re.MULTILINE)
     assert (REPOSITORY / 'docs' / path).samefile(REPOSITORY / 'config' / 'default.yaml')
-    _, _, *rows = (line for line in removed.splitlines() if line.startswith('|'))
-    shown = (line[2:-2].split(' | ') for line in rows)
-    found = [(name, use) for names, use in shown for name in names.split(', ')]
-    assert sorted(found) == sorted((f'`{name}`', use) for name, use in REMOVED.items())
 
 
 @pytest.mark.parametrize('marks', ['', 'b', 'e', 'eb', 'bbe', 'bee'])

@@ -11,8 +11,6 @@ import pytest
 import yaml
 from conftest import REPOSITORY, load_script
 
-from gp_ground_seg.core.parameters.removed import REMOVED
-
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
 FILE = REPOSITORY / 'launch' / 'ground_segmentation.launch.py'
@@ -47,7 +45,6 @@ def test_rviz_is_told_of_each_topic_that_it_shows():
 
 OURS = 'gp_ground_seg', FILE.name
 WRONG = 'params_file:=/no/such.yaml', 'params:=3', 'rviz:=perhaps', 'required:=soon'
-GONE = [key for key in REMOVED if key.startswith(f'{FILE.name} ')]
 
 
 def launched(*words):
@@ -83,7 +80,6 @@ def test_launch_starts_the_node_and_the_two_of_the_page(ros2_launch, tmp_path):
     ('word', 'said'),
     [
         (WRONG[0], 'params_file:='),
-        (f'{GONE[0].split()[1]}:=1', f'{GONE[0]} was removed: {REMOVED[GONE[0]]}'),
         ('rviz:=True', 'listening to'),  # as Nav2 writes it
         ('use_sim_time:=True', 'listening to'),
     ],
@@ -192,15 +188,6 @@ def failure_of(*found):
 @pytest.mark.parametrize('word', [*WRONG, 'use_sim_time:=yes'])
 def test_a_wrong_argument_starts_nothing(actions, word):
     assert failure_of(*actions(word)).startswith(word)
-
-
-@pytest.mark.parametrize('key', GONE)
-def test_an_argument_that_is_gone_says_what_to_use_instead(actions, key):
-    (said, options), (kind, _) = actions(f'{key.split()[1]}:=1')
-    assert (said, kind) == ('LogInfo', 'Node')
-    assert options['msg'] == f'{key} was removed: {REMOVED[key]}'
-    ((kind, _),) = actions(f'{key.split()[1]}:=')
-    assert kind == 'Node'
 
 
 @pytest.mark.parametrize('pushed', ['', '/robot'])

@@ -16,7 +16,6 @@ from ros_helpers import bench, street, to_message
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.config import PRESETS, find_spec, parameter_specs
-from gp_ground_seg.core.parameters.removed import REMOVED
 from gp_ground_seg.ros.loader import CHANGED
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
@@ -295,29 +294,6 @@ def test_unknown_names_are_reported_and_not_declared(tmp_path):
     assert '  sensor.height: 2.5 m  (default auto)' in shown
     assert len(shown) == len(changes)  # a line for each that differs, and no other
     assert 'ros2 param dump /ground_segmentation_node' in log
-
-
-def test_what_is_removed_is_a_warning_at_the_start_and_refused_later(tmp_path):
-    """A node with the parameter file of an earlier release starts; all else in it holds."""
-    path = tmp_path / 'old.yaml'
-    groups = {
-        'learning': {'mode': 'every_k', 'period': 3, 'segment_step': 20},
-        'output': {'max_range': 20.0},
-        'diagnostics': {'recover_after': 0.0},
-    }
-    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': groups}}))
-    with ros.stderr_in(tmp_path) as stderr, ros.started_node('--params-file', str(path)) as node:
-        assert node.config == Config().replace(**{'learning.segment_step': 20})
-        log = ros.said_by(stderr, 'output.max_range')
-        removed = 'learning.period', 'diagnostics.recover_after', 'output.max_range'
-        for key in ('learning.mode=every_k', *removed):
-            name, line = key.split('=')[0], f'{key} was removed: {REMOVED[key]}'
-            assert log.count(f'parameter {name} is not used: {line}\n') == 1
-            assert name == 'learning.mode' or not node.has_parameter(name)
-            group, field = name.split('.')
-            value = Parameter(name, value=groups[group][field])
-            result = node.set_parameters_atomically([value])
-            assert (result.successful, result.reason) == (False, line)
 
 
 def test_a_start_with_the_defaults_is_one_line_about_them(tmp_path):

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import yaml
 
 from gp_ground_seg.core.errors import LOGGER, ConfigError, in_one_line, reason_of
-from gp_ground_seg.core.parameters.removed import removal
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -117,8 +116,6 @@ class ParameterSpec:
                     return float(value)
                 if isinstance(value, numbers.Integral):
                     return int(value)
-        if line := removal(self.name, value):
-            raise ConfigError(line)
         given = repr(value) if len(repr(value)) <= 100 else f'{repr(value)[:100]} ...'
         raise ConfigError(f'{self.name} = {given}: must be {self.accepted}')
 
@@ -189,15 +186,10 @@ class ParameterGroups:
 
     @classmethod
     def find_spec(cls, name: str) -> ParameterSpec:
-        """Return the declaration of one parameter.
-
-        Raises ConfigError with what to use instead, or with the nearest name.
-        """
+        """Return the declaration of one parameter; ConfigError with the nearest name if none."""
         specs = cls.specs()
         if name in specs:
             return specs[name]
-        if line := removal(name):
-            raise ConfigError(line)
         members = [known for known in specs if known.startswith(f'{name}.')]
         if members:
             raise ConfigError(f'{name!r} is a group of parameters: {", ".join(members)}')
