@@ -62,14 +62,11 @@ class Probe:
     def __init__(self, session):
         from sensor_msgs.msg import PointCloud2
 
-        from gp_ground_seg.ros.input import cloud_profile
-
         self._session, self._sent, self._back = session, {}, {}
-        self._publisher = session.node.create_publisher(PointCloud2, INPUT, cloud_profile(10))
+        self._publisher = session.publisher_of_clouds(INPUT, 10)
         for topic in OUTPUTS:
             take = partial(self._take, topic)
-            profile = cloud_profile(50)
-            session.node.create_subscription(PointCloud2, topic, take, profile, raw=True)
+            session.node.create_subscription(PointCloud2, topic, take, 50, raw=True)
 
     def _take(self, topic, raw, info):
         back = self._back.setdefault(stamp_of(decode_cloud(raw)), {})

@@ -86,15 +86,16 @@ class InputTask:
         self._frame = self._fields = self._last_error = ''
         self._stamp: float | None = None
 
-    def arrived(self, now: float, stamp: float, frame: str, fields: Sequence[str]) -> None:
-        """Count a cloud; `stamp` is the time in its header [s]."""
+    def arrived(self, now: float, cloud: PointCloud2) -> None:
+        """Count a cloud."""
         if self._is_reported:
             self._n_recent = self._n_refused_recent = 0
         self._is_reported = False
         self._n_recent += 1
         self._last_arrival = now
         self._arrivals.count(now)
-        self._stamp, self._frame, self._fields = stamp, frame, ' '.join(fields)
+        self._stamp, self._frame = seconds_of(cloud.header.stamp), cloud.header.frame_id
+        self._fields = ' '.join(field.name for field in cloud.fields)
 
     def refused(self, reason: str) -> None:
         """Count the cloud that arrived last as one that could not be processed."""
@@ -139,20 +140,19 @@ class InputTask:
         if facts.idle:
             return Level.OK, f'not listening to {facts.topic}: {facts.idle}'
         if silence > stale_after:
-            source = (
-                f'publishers: {facts.n_publishers}'
-                if facts.n_publishers
-                else 'nobody sends clouds'
-            )
-            why = f'; {facts.fault}' if facts.fault else ''
-            return Level.STALE, f'no cloud on {facts.topic} for {silence:.1f} s ({source}){why}'
+            n = facts.n_publishers
+            source = f'publishers: {n}' if n else 'nobody sends clouds'
+            said = f'no cloud on {facts.topic} for {silence:.1f} s ({source})'
+            return Level.STALE, f'{said}; {facts.fault}' if facts.fault else said
+        if n_refused:
+            every = n_refused == n_received
+            share = 'every cloud' if every else f'{n_refused} of {n_received} clouds'
+            return Level.ERROR, f'{share} refused: {self._last_error}'
         # A stamp may be of any age: a recording is played at any time.
-        if n_refused == 0:
-            waiting = f'waiting for the first cloud on {facts.topic}'
-            found = Level.OK, 'receiving' if n_received else waiting
-            return (Level.WARN, facts.fault) if facts.fault else found
-        share = 'every cloud' if n_refused == n_received else f'{n_refused} of {n_received} clouds'
-        return Level.ERROR, f'{share} refused: {self._last_error}'
+        if facts.fault:
+            return Level.WARN, facts.fault
+        waiting = f'waiting for the first cloud on {facts.topic}'
+        return Level.OK, 'receiving' if n_received else waiting
 
 
 class ProcessingTask:
@@ -162,6 +162,7 @@ class ProcessingTask:
         # Of the newest clouds, from arrival to publication [s].
         self._latencies: deque[float] = deque(maxlen=CLOUD_WINDOW)
         self._n_processed = self._n_dropped = 0
+        # Since the last report.
         self._n_sent_recent = self._n_dropped_recent = 0
         self._backend = ''
 
@@ -179,30 +180,26 @@ class ProcessingTask:
 
     def report(self, limits: DiagnosticsConfig) -> Status:
         """Judge the latest clouds, and the losses since the last report."""
-        latency = float(np.median(self._latencies)) if self._latencies else None
+        latency = 1e3 * float(np.median(self._latencies)) if self._latencies else None
+        limit, n_dropped = 1e3 * limits.max_latency, self._n_dropped_recent
+        faults = []
+        if latency is not None and latency > limit:
+            faults.append(f'median latency {latency:.0f} ms, above {limit:g} ms')
+        if n_dropped:
+            faults.append(
+                f'{n_dropped} of {self._n_sent_recent} clouds dropped since the last report'
+            )
+        self._n_sent_recent = self._n_dropped_recent = 0
+        good = 'no cloud processed yet' if latency is None else f'median latency {latency:.1f} ms'
         values = {
             'Clouds since startup': str(self._n_processed),
             'Dropped since startup': str(self._n_dropped),
-            'Median latency (ms)': _digits(None if latency is None else 1e3 * latency, '.2f'),
+            'Median latency (ms)': _digits(latency, '.2f'),
             'Backend': self._backend,
         }
-        found = self._judge(latency, limits)
-        self._n_sent_recent = self._n_dropped_recent = 0
-        return Status('processing', *found, values)
-
-    def _judge(self, latency: float | None, limits: DiagnosticsConfig) -> Finding:
-        n_dropped, faults = self._n_dropped_recent, []
-        if latency is not None and latency > limits.max_latency:
-            limit = 1e3 * limits.max_latency
-            faults.append(f'median latency {1e3 * latency:.0f} ms, above {limit:g} ms')
-        if n_dropped:
-            n_sent = self._n_sent_recent
-            faults.append(f'{n_dropped} of {n_sent} clouds dropped since the last report')
-        if faults:
-            return Level.WARN, '; '.join(faults)
-        if latency is None:
-            return Level.OK, 'no cloud processed yet'
-        return Level.OK, f'median latency {1e3 * latency:.1f} ms'
+        return Status(
+            'processing', Level.WARN if faults else Level.OK, '; '.join(faults) or good, values
+        )
 
 
 class ModelTask:
@@ -243,18 +240,25 @@ class ModelTask:
             'Objective per candidate': _digits(fit.objective * per_candidate, '.4f'),
             **{f'theta {name}': f'{value:.4g}' for name, value in fit.theta.items()},
         }
-        return Status('model', *_judge_model(scan), values)
+        faults = _faults_of(scan)
+        good = 'ground found in the newest cloud'
+        return Status(
+            'model', Level.WARN if faults else Level.OK, '; '.join(faults) or good, values
+        )
 
 
-def _judge_model(scan: Segmentation) -> Finding:
-    doubtful = (*scan.pose.contradictions, *_pose_warnings(scan))
-    if doubtful:
-        return Level.WARN, '; '.join(doubtful)
+def _faults_of(scan: Segmentation) -> list[str]:
+    """Return doubts of the pose that was used; without any, why there is no good model."""
+    pose = scan.pose
+    faults = [*pose.contradictions]
+    if scan.label.any():  # an empty cloud shows nothing of the pose
+        faults += [kept_height(pose)] if pose.is_fallback else pose.warnings
+    if faults:
+        return faults
     if not scan.fit.n_segments:
-        return Level.WARN, 'no ground found in the newest cloud'
-    if scan.fit.status == 'failed':
-        return Level.WARN, 'the hyper-parameters could not be learned'
-    return Level.OK, 'ground found in the newest cloud'
+        return ['no ground found in the newest cloud']
+    is_failed = scan.fit.status == 'failed'
+    return ['the hyper-parameters could not be learned'] if is_failed else []
 
 
 def kept_height(pose: SensorPose) -> str:
@@ -263,13 +267,6 @@ def kept_height(pose: SensorPose) -> str:
         'the cloud does not show the ground near the sensor well: the height of '
         f'{pose.height:.2f} m of an earlier one is kept; set sensor.height'
     )
-
-
-def _pose_warnings(scan: Segmentation) -> tuple[str, ...]:
-    """Warnings of the pose used; an empty cloud has none."""
-    if not scan.label.any():
-        return ()
-    return (kept_height(scan.pose),) if scan.pose.is_fallback else scan.pose.warnings
 
 
 def _pose_values(pose: SensorPose) -> dict[str, str]:
@@ -335,8 +332,7 @@ class Diagnostics:
 
     def arrived(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
         """Count a cloud that came at the time `arrival` [s], and `n_lost` before it."""
-        fields = [field.name for field in cloud.fields]
-        self.input.arrived(arrival, seconds_of(cloud.header.stamp), cloud.header.frame_id, fields)
+        self.input.arrived(arrival, cloud)
         self.processing.arrived(n_lost)
 
     def published(

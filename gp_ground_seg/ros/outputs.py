@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 
-from gp_ground_seg.core.frame import NOT_FINITE
+from gp_ground_seg.core.frame import NOT_FINITE, BoolArray
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.costmap import (
     DIRECTIONS,
@@ -30,10 +30,11 @@ from gp_ground_seg.data.point_cloud2 import (
     select_points,
 )
 from gp_ground_seg.ros.ground_model import ground_model_cloud
-from gp_ground_seg.ros.input import cloud_profile, seconds_of
+from gp_ground_seg.ros.input import seconds_of
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
+OUTPUT_DEPTH = 20  # messages kept: Fast DDS may send a lost fragment again after 0.7 s only
 LONGEST_PERIOD = 1.0
 """Time between two clouds from which it says nothing of the sensor [s]: clouds are missing."""
 
@@ -115,29 +116,20 @@ def occupancy_grid(segmented: SegmentedCloud) -> OccupancyGrid:
     return message
 
 
+def _selected(segmented: SegmentedCloud, chosen: BoolArray) -> PointCloud2:
+    """Return the `chosen` points, (N,) bool, which are finite, with every byte of each."""
+    return select_points(segmented.cloud, chosen, message_bytes, are_finite=True)
+
+
 LABELLED = Output(
     '~/labeled', PointCloud2, lambda s: labelled_cloud(s.cloud, s.segmentation), True
 )
 OUTPUTS = (
-    # Ground and obstacles are finite points.
-    Output(
-        'ground',
-        PointCloud2,
-        lambda s: select_points(s.cloud, s.is_ground, message_bytes, are_finite=True),
-        False,
-    ),
-    Output(
-        'obstacles',
-        PointCloud2,
-        lambda s: select_points(s.cloud, s.is_obstacle, message_bytes, are_finite=True),
-        False,
-    ),
+    Output('ground', PointCloud2, lambda s: _selected(s, s.is_ground), False),
+    Output('obstacles', PointCloud2, lambda s: _selected(s, s.is_obstacle), False),
     LABELLED,
     Output(
-        '~/ground_model',
-        PointCloud2,
-        lambda s: ground_model_cloud(s.cloud, s.segmentation),
-        True,
+        '~/ground_model', PointCloud2, lambda s: ground_model_cloud(s.cloud, s.segmentation), True
     ),
     Output('~/scan', LaserScan, scan, True),
     Output('~/occupancy', OccupancyGrid, occupancy_grid, True),
@@ -154,7 +146,7 @@ class OutputPublishers:
         self._renamed: dict[str, str] = {}
         options = {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
         self._publishers = [
-            (o, node.create_publisher(o.message_type, o.topic, cloud_profile(), **options))
+            (o, node.create_publisher(o.message_type, o.topic, OUTPUT_DEPTH, **options))
             for o in OUTPUTS
         ]
 
@@ -186,6 +178,6 @@ class OutputPublishers:
             self._renamed = renamed
             for field, name in renamed.items():
                 self._logger.warning(
-                    f'the input has a field {field} already, which is kept; '
-                    f'in ~/labeled ours is {name}'
+                    f'the input has a field {field} already, which is kept; in ~/labeled ours is '
+                    f'{name}'
                 )
