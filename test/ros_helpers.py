@@ -141,14 +141,17 @@ def street(n_points, seed=0, n_invalid=0):
     return points
 
 
+_CODES = ('i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'f4', 'f8')
+
+
 def to_message(points, stamp=(0, 0), frame=''):
     """Message of structured points."""
     message = PointCloud2(height=1, width=len(points), row_step=points.nbytes)
     message.header.stamp.sec, message.header.stamp.nanosec = stamp
     message.header.frame_id = frame
     message.fields = [
-        PointField(name=name, offset=offset, datatype=PointField.FLOAT32, count=1)
-        for name, (_, offset) in points.dtype.fields.items()
+        PointField(name=name, offset=offset, datatype=1 + _CODES.index(of.str[1:]), count=1)
+        for name, (of, offset) in points.dtype.fields.items()
     ]
     message.point_step = points.dtype.itemsize
     message.data = array('B', points.tobytes())

@@ -10,7 +10,7 @@ import types
 import numpy as np
 import pytest
 import ros_helpers as ros
-from geometry_msgs.msg import Quaternion, TransformStamped
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.time import Time
@@ -119,8 +119,7 @@ def test_given_tilt_levels_and_leaves_the_points_as_they_are():
 class StandInBuffer:
     """The part of ``tf2_ros.Buffer`` that is used, with what a test puts in.
 
-    tf2_ros has no wheel, nor have its messages; where it is installed, the test below runs
-    the real one.
+    tf2_ros has no wheel, nor have its messages; where it is installed, the last test runs it.
     """
 
     known: dict = {}  # noqa: RUF012
@@ -133,11 +132,9 @@ class StandInBuffer:
             raise LookupError(f'"{target}" passed to lookupTransform does not exist')
         if time.nanoseconds > self.newest * 10**9:
             raise IndexError('would require extrapolation into the future')
-        message = TransformStamped()
-        message.transform.rotation = self.known[target, source]
-        place = message.transform.translation
-        place.x, place.y, place.z = self.place
-        return message
+        transform = Transform(rotation=self.known[target, source])
+        transform.translation.x, transform.translation.y, transform.translation.z = self.place
+        return types.SimpleNamespace(transform=transform)
 
     def clear(self):
         type(self).cleared += 1
@@ -160,6 +157,7 @@ def stand_in(monkeypatch):
     errors = {'TransformException': LookupError, 'ExtrapolationException': IndexError}
     parts = {'Buffer': StandInBuffer, 'TransformListener': StandInListener, **errors}
     monkeypatch.setitem(sys.modules, 'tf2_ros', types.SimpleNamespace(**parts))
+    monkeypatch.setattr(StandInBuffer, 'known', {})
 
 
 @pytest.mark.usefixtures('stand_in')

@@ -137,8 +137,8 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(tmp_path):
     assert [*values['processing']] == PROCESSING_KEYS.split('; ')
     model = [key for key in values['model'] if not key.startswith('theta ')]
     assert model == MODEL_KEYS.split('; ') and len(values['model']) > len(model)
-    outputs = [f'{node_name}/{name}' for name in ('labeled', 'ground_model', 'scan', 'occupancy')]
-    topics = [f'{NAMESPACE}/ground', f'{NAMESPACE}/obstacles', *outputs]
+    outputs = (f'{node_name}/{name}' for name in ('labeled', 'ground_model', 'scan', 'occupancy'))
+    topics = f'{NAMESPACE}/ground', f'{NAMESPACE}/obstacles', *outputs
     facts = ('subscribers', 'rate (Hz)', 'since startup')
     assert [*values['output']] == [f'{topic} {fact}' for topic in topics for fact in facts]
     # A stamp of 2011 is old, and nothing is wrong with that.
@@ -156,7 +156,6 @@ def test_simulated_time_that_jumps_back_is_counted_once():
         def wait_for_input(counter, value):
             return ros.values_of(b.wait_for_status('input', lambda v, _: v[counter] == value))
 
-        # Diagnostics come without a clock too.
         assert b.node.get_clock().ros_time_is_active
         b.segment(to_message(street(3000)))
         wait_for_input('Events since startup', '1')
