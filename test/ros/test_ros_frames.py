@@ -83,14 +83,6 @@ def test_what_is_no_rotation_is_refused(w):
         rotation_of(Quaternion(x=0.0, w=w))
 
 
-@pytest.mark.skipif(HAS_TF2, reason='tf2_ros is installed')
-def test_without_tf2_the_node_says_what_to_do_and_exits_2(capfd):
-    error = ros.start_error(capfd, '-p', 'frame.level:=tf')
-    assert 'frame.level = tf: needs tf2_ros' in error
-    assert 'apt install ros-jazzy-tf2-ros-py' in error
-    assert 'sensor.roll' in error
-
-
 def test_given_tilt_levels_and_leaves_the_points_as_they_are():
     points, _ = turned_street()
     message = to_message(points, stamp=(3, 4), frame='tilted_lidar')
@@ -267,12 +259,29 @@ def test_the_crop_box_is_in_the_base_of_tf(monkeypatch):
     assert found == sorted(row for row, is_body in zip(rows, inside, strict=True) if not is_body)
 
 
-def imu_message(matrix, stamp, frame='tilted_lidar', has_orientation=True):
-    message = Imu(orientation=quaternion(matrix))
-    message.header.stamp.sec, message.header.stamp.nanosec = stamp
-    message.header.frame_id = frame
-    message.orientation_covariance[0] = 0.01 if has_orientation else -1.0
-    return message
+class ImuProbe:
+    """Sends clouds of a turned street, and orientations, to a node that takes both."""
+
+    def __init__(self, bench, points):
+        self.bench, self.points = bench, points
+        self.publisher = bench.probe.create_publisher(Imu, 'imu', ros.BEST_EFFORT)
+        wait_for(lambda: self.publisher.get_subscription_count() == 1, 'subscription of imu')
+
+    def cloud(self, seconds, nanosec=10_000_000):
+        return to_message(self.points, stamp=(seconds, nanosec), frame='tilted_lidar')
+
+    def say(self, matrix, stamp, frame='tilted_lidar', covariance=0.01):
+        n_before = len(self.bench.node._frames._imu._messages)
+        message = Imu(orientation=quaternion(matrix))
+        message.header.stamp.sec, message.header.stamp.nanosec = stamp
+        message.header.frame_id = frame
+        message.orientation_covariance[0] = covariance
+        self.publisher.publish(message)
+        wait_for(lambda: len(self.bench.node._frames._imu._messages) > n_before, 'orientation')
+
+    def check_refused(self, reason, seconds, nanosec=10_000_000):
+        self.bench.publisher.publish(self.cloud(seconds, nanosec))
+        self.bench.wait_for_status('input', lambda _, s: reason in s.message)
 
 
 BY_IMU = {**VALUES, 'frame.level': 'imu', 'diagnostics.period': 0.1}
@@ -280,56 +289,42 @@ BY_IMU = {**VALUES, 'frame.level': 'imu', 'diagnostics.period': 0.1}
 
 def test_tilt_by_an_imu(monkeypatch):
     points, turn = turned_street(yaw=1.0)
-
-    def cloud(seconds, nanosec=10_000_000):
-        return to_message(points, stamp=(seconds, nanosec), frame='tilted_lidar')
-
     with bench(*ros.given(BY_IMU)) as b:
-        imu = b.probe.create_publisher(Imu, 'imu', 10)
-        wait_for(lambda: imu.get_subscription_count() == 1, 'subscription of imu')
-
-        def refused(seconds, reason, nanosec=10_000_000):
-            b.publisher.publish(cloud(seconds, nanosec))
-            return b.wait_for_status('input', lambda _, s: reason in s.message)
-
-        refused(2, f'no message on {ros.NAMESPACE}/imu, for frame.level = imu')
+        imu = ImuProbe(b, points)
+        imu.check_refused(f'no message on {ros.NAMESPACE}/imu, for frame.level = imu', 2)
         # A cloud waits for the first orientation that is newer; the nearest in time holds.
         monkeypatch.setattr(transforms, 'MAX_WAIT', 60.0)
-        b.publisher.publish(cloud(3))
+        b.publisher.publish(imu.cloud(3))
         wait_for(lambda: len(b.node._frames._waiting) == 1, 'cloud that waits')
-        imu.publish(imu_message(np.eye(3), (3, 0)))
-        wait_for(lambda: b.node._frames._imu._messages, 'orientation')
+        imu.say(np.eye(3), (3, 0))
         time.sleep(5 * transforms.REVIEW_PERIOD)
         assert len(b.node._frames._waiting) == 1
         for nanosec, matrix in ((9_000_000, turn), (12_000_000, np.eye(3))):
-            imu.publish(imu_message(matrix, (3, nanosec)))
-        check_levelled(points, cloud(3), (b.ground.wait(1)[0], b.obstacles.wait(1)[0]))
+            imu.say(matrix, (3, nanosec))
+        check_levelled(points, imu.cloud(3), (b.ground.wait(1)[0], b.obstacles.wait(1)[0]))
         # Refused: far from it in time, without an orientation, in a frame that is not known.
         monkeypatch.setattr(transforms, 'MAX_WAIT', 0.1)
-        refused(3, 'is 0.058 s from its stamp: must be within 0.05 s', 70_000_000)
-        imu.publish(imu_message(turn, (5, 10_000_000), has_orientation=False))
-        refused(5, 'orientation_covariance[0] is -1')
-        imu.publish(imu_message(turn, (6, 10_000_000), frame='imu_link'))
-        refused(6, 'to that of /test_' if HAS_TF2 else 'needs tf2_ros (sudo apt install')
+        imu.check_refused('is 0.058 s from its stamp: must be within 0.05 s', 3, 70_000_000)
+        imu.say(turn, (5, 10_000_000), covariance=-1.0)
+        imu.check_refused('orientation_covariance[0] is -1', 5)
+        imu.say(turn, (6, 10_000_000), frame='imu_link')
+        unknown = 'to that of /test_' if HAS_TF2 else 'needs tf2_ros (sudo apt install'
+        imu.check_refused(unknown, 6)
         assert len(b.ground.messages) == 1
         assert b.set('frame.level', 'sensor').successful
-        wait_for(lambda: imu.get_subscription_count() == 0, 'end of the subscription of imu')
-        assert len(b.segment(cloud(7))) == 2
+        wait_for(lambda: imu.publisher.get_subscription_count() == 0, 'end of the subscription')
+        assert len(b.segment(imu.cloud(7))) == 2
 
 
 @pytest.mark.usefixtures('stand_in')
-def test_tilt_by_an_imu_in_another_frame(monkeypatch):
+def test_tilt_by_an_imu_in_another_frame():
     points, turn = turned_street(yaw=1.0)
     mount = rotation(-1.2, 0.7)
-    known = {('imu_link', 'tilted_lidar'): quaternion(mount)}
-    monkeypatch.setattr(StandInBuffer, 'known', known)
-    message = to_message(points, stamp=(3, 4), frame='tilted_lidar')
+    StandInBuffer.known['imu_link', 'tilted_lidar'] = quaternion(mount)
     with bench(*ros.given(BY_IMU)) as b:
-        imu = b.probe.create_publisher(Imu, 'imu', ros.BEST_EFFORT)
-        wait_for(lambda: imu.get_subscription_count() == 1, 'subscription of imu')
-        imu.publish(imu_message(turn @ mount.T, (3, 5), 'imu_link'))
-        wait_for(lambda: b.node._frames._imu._messages, 'orientation')
-        check_levelled(points, message, b.segment(message))
+        imu = ImuProbe(b, points)
+        imu.say(turn @ mount.T, (3, 20_000_000), 'imu_link')
+        check_levelled(points, imu.cloud(3), b.segment(imu.cloud(3)))
 
 
 @pytest.mark.skipif(not HAS_TF2, reason='tf2_ros is not installed (it has no wheel)')

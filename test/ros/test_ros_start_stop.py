@@ -1,5 +1,6 @@
 """Start and end of ROS processes: arguments that are wrong, signals at any time."""
 
+import importlib.util
 import os
 import re
 import signal
@@ -59,6 +60,11 @@ WORDS = {
     'ROS_DOMAIN_ID=999': 'must be an integer in [0, 232]',
     'ROS_DOMAIN_ID=a': 'not an integral',
 }
+if importlib.util.find_spec('tf2_ros') is None:
+    WORDS['-p frame.level:=tf'] = (
+        'frame.level = tf: needs tf2_ros, which cannot be imported: sudo apt install '
+        'ros-jazzy-tf2-ros-py, or use frame.level = sensor with sensor.roll'
+    )
 
 
 @pytest.mark.parametrize('text', FILES)
