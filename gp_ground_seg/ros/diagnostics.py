@@ -39,6 +39,11 @@ class Status(NamedTuple):
     values: dict[str, str]
 
 
+def judged(task: str, faults: Sequence[str], good: str, values: dict[str, str]) -> Status:
+    """Return a WARN with all `faults`; without any, OK with the message `good`."""
+    return Status(task, Level.WARN if faults else Level.OK, '; '.join(faults) or good, values)
+
+
 class Rate:
     """Events in all, and in the last `RATE_WINDOW` seconds."""
 
@@ -197,54 +202,36 @@ class ProcessingTask:
             'Median latency (ms)': _digits(latency, '.2f'),
             'Backend': self._backend,
         }
-        return Status(
-            'processing', Level.WARN if faults else Level.OK, '; '.join(faults) or good, values
-        )
+        return judged('processing', faults, good, values)
 
 
-class ModelTask:
-    """The newest scan; its statistics are computed for a report only."""
-
-    _newest: Segmentation | None = None
-    _n_learned = 0
-
-    def segmented(self, segmentation: Segmentation) -> None:
-        """Keep a scan."""
-        self._newest = segmentation
-        self._n_learned += segmentation.fit.n_evaluations > 0
-
-    def report(self) -> Status:
-        """Judge the newest scan."""
-        scan = self._newest
-        if scan is None:
-            return Status('model', Level.OK, 'no cloud segmented yet', {})
-        fit, label = scan.fit, scan.label
-        has_model = np.isfinite(scan.labelled.height)
-        without_model = _mean(~has_model & (label != Label.UNKNOWN))
-        per_candidate = fit.n_inliers / fit.n_candidates if fit.n_candidates else np.nan
-        values = {
-            'Segments with a model': f'{fit.n_segments} of {len(scan.surface.mean)}',
-            'Ground fraction': _digits(_mean(label == Label.GROUND), '.4f'),
-            'Unknown fraction': _digits(_mean(label == Label.UNKNOWN), '.4f'),
-            'Points without a return': str(np.count_nonzero(label == Label.UNKNOWN)),
-            'Fraction without model': _digits(without_model, '.4f'),
-            'Candidates': str(fit.n_candidates),
-            'Inliers': str(fit.n_inliers),
-            **_pose_values(scan.pose),
-            'Noise (m)': _digits(fit.theta.get('sigma_n'), '.4g'),
-            'Learning mode': fit.mode,
-            'Learned since startup': str(self._n_learned),
-            'Optimiser status': fit.status,
-            'Evaluations': str(fit.n_evaluations),
-            'At bound': ' '.join(fit.at_bound) or 'none',
-            'Objective per candidate': _digits(fit.objective * per_candidate, '.4f'),
-            **{f'theta {name}': f'{value:.4g}' for name, value in fit.theta.items()},
-        }
-        faults = _faults_of(scan)
-        good = 'ground found in the newest cloud'
-        return Status(
-            'model', Level.WARN if faults else Level.OK, '; '.join(faults) or good, values
-        )
+def model_status(scan: Segmentation | None, n_learned: int) -> Status:
+    """Judge the newest scan; from `n_learned` scans hyper-parameters were learned."""
+    if scan is None:
+        return Status('model', Level.OK, 'no cloud segmented yet', {})
+    fit, label = scan.fit, scan.label
+    has_model = np.isfinite(scan.labelled.height)
+    without_model = _mean(~has_model & (label != Label.UNKNOWN))
+    per_candidate = fit.n_inliers / fit.n_candidates if fit.n_candidates else np.nan
+    values = {
+        'Segments with a model': f'{fit.n_segments} of {len(scan.surface.mean)}',
+        'Ground fraction': _digits(_mean(label == Label.GROUND), '.4f'),
+        'Unknown fraction': _digits(_mean(label == Label.UNKNOWN), '.4f'),
+        'Points without a return': str(np.count_nonzero(label == Label.UNKNOWN)),
+        'Fraction without model': _digits(without_model, '.4f'),
+        'Candidates': str(fit.n_candidates),
+        'Inliers': str(fit.n_inliers),
+        **_pose_values(scan.pose),
+        'Noise (m)': _digits(fit.theta.get('sigma_n'), '.4g'),
+        'Learning mode': fit.mode,
+        'Learned since startup': str(n_learned),
+        'Optimiser status': fit.status,
+        'Evaluations': str(fit.n_evaluations),
+        'At bound': ' '.join(fit.at_bound) or 'none',
+        'Objective per candidate': _digits(fit.objective * per_candidate, '.4f'),
+        **{f'theta {name}': f'{value:.4g}' for name, value in fit.theta.items()},
+    }
+    return judged('model', _faults_of(scan), 'ground found in the newest cloud', values)
 
 
 def _faults_of(scan: Segmentation) -> list[str]:
@@ -285,27 +272,18 @@ def _pose_values(pose: SensorPose) -> dict[str, str]:
     }
 
 
-class OutputTask:
-    """Messages per topic."""
-
-    def __init__(self) -> None:
-        self._rates: defaultdict[str, Rate] = defaultdict(Rate)
-
-    def published(self, now: float, topics: Sequence[str]) -> None:
-        """Count one message on each of the `topics`."""
-        for topic in topics:
-            self._rates[topic].count(now)
-
-    def report(self, now: float, n_subscribers: Mapping[str, int]) -> Status:
-        """List all topics, with their subscribers."""
-        values = {}
-        for topic, n in n_subscribers.items():
-            values[f'{topic} subscribers'] = str(n)
-            values[f'{topic} rate (Hz)'] = _digits(self._rates[topic].window(now)[2], '.2f')
-            values[f'{topic} since startup'] = str(self._rates[topic].n_total)
-        heard = [topic for topic, n in n_subscribers.items() if n]
-        message = f'subscribed to: {", ".join(heard)}' if heard else 'nobody subscribes'
-        return Status('output', Level.OK, message, values)
+def output_status(
+    now: float, rates: Mapping[str, Rate], n_subscribers: Mapping[str, int]
+) -> Status:
+    """List all topics, with their subscribers, and the rates of their messages."""
+    values = {}
+    for topic, n in n_subscribers.items():
+        values[f'{topic} subscribers'] = str(n)
+        values[f'{topic} rate (Hz)'] = _digits(rates[topic].window(now)[2], '.2f')
+        values[f'{topic} since startup'] = str(rates[topic].n_total)
+    heard = ', '.join(topic for topic, n in n_subscribers.items() if n)
+    good = f'subscribed to: {heard}' if heard else 'nobody subscribes'
+    return judged('output', [], good, values)
 
 
 State = tuple[InputFacts, Mapping[str, int]]
@@ -317,7 +295,10 @@ class Diagnostics:
 
     def __init__(self, node: Node, state: Callable[[], State], limits: DiagnosticsConfig) -> None:
         self.input = InputTask(time.monotonic())
-        self.processing, self.model, self.output = ProcessingTask(), ModelTask(), OutputTask()
+        self.processing = ProcessingTask()
+        self._newest: Segmentation | None = None  # its statistics are computed for a report only
+        self._n_learned = 0
+        self._rates: defaultdict[str, Rate] = defaultdict(Rate)  # of the output topics
         self._node, self._state, self._limits = node, state, limits
         self._next_log, self._n_logged = np.inf, '0'
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -347,8 +328,10 @@ class Diagnostics:
         times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
         self._node.get_logger().debug(f'times of the stages [ms]: {times}')
         self.processing.processed(now - arrival, scan.fit.backend)
-        self.model.segmented(scan)
-        self.output.published(now, topics)
+        self._newest = scan
+        self._n_learned += scan.fit.n_evaluations > 0
+        for topic in topics:
+            self._rates[topic].count(now)
 
     def report(self, now: float) -> list[Status]:
         """Return the status of each task."""
@@ -356,8 +339,8 @@ class Diagnostics:
         found = [
             self.input.report(now, facts, self._limits),
             self.processing.report(self._limits),
-            self.model.report(),
-            self.output.report(now, n_subscribers),
+            model_status(self._newest, self._n_learned),
+            output_status(now, self._rates, n_subscribers),
         ]
         self._log(now, {name: text for status in found for name, text in status.values.items()})
         return found

@@ -127,8 +127,8 @@ def test_the_node_of_the_wheel_starts(installed, tmp_path):
     ros = pytest.importorskip('ros_helpers')
     code = (
         f'import sys; sys.path.insert(0, {str(installed)!r}); '
-        'from gp_ground_seg.cli.node import main; from gp_ground_seg.ros import session; '
-        'print(session._find_profile(), file=sys.stderr); sys.exit(main())'
+        'from gp_ground_seg.cli.node import main; from gp_ground_seg.ros import start_stop; '
+        'print(start_stop._find_profile(), file=sys.stderr); sys.exit(main())'
     )
     words = *ros.IN_NAMESPACE, '-p', 'runtime.backend:=numpy'
     with ros.Process(*words, folder=tmp_path, start=('-c', code)) as node:

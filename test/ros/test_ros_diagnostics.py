@@ -19,9 +19,10 @@ from gp_ground_seg.ros.diagnostics import (
     InputFacts,
     InputTask,
     Level,
-    ModelTask,
     ProcessingTask,
     Rate,
+    model_status,
+    output_status,
 )  # fmt: skip
 from gp_ground_seg.ros.input import JUMP_TOLERANCE, TimeJumps
 
@@ -82,7 +83,7 @@ def test_a_line_of_the_log_after_ten_seconds_then_one_in_a_minute_while_clouds_c
         if second < 25 or second == 150:
             reporter.arrived(CLOUD, second, 0)
             process(reporter.processing, [0.0125])
-            reporter.model.segmented(GroundSegmenter().segment(np.zeros((0, 3))))
+            reporter._newest = GroundSegmenter().segment(np.zeros((0, 3)))
         reporter.report(second + 0.5)
         lines += [second] * (said.call_count > len(lines))
     # The line at 70 is on clouds that came after the line at 10.
@@ -185,14 +186,12 @@ def test_drops_are_a_warning_once_and_counted_for_ever():
 
 def status_of(points, **changes):
     """Segmentation, and what is reported of it."""
-    statistics = ModelTask()
-    assert statistics.report().level == Level.OK
     segmentation = GroundSegmenter(Config().replace(**changes)).segment(points)
-    statistics.segmented(segmentation)
-    return segmentation, statistics.report()
+    return segmentation, model_status(segmentation, 3)
 
 
 def test_model_reports_the_newest_scan():
+    assert model_status(None, 0).level == Level.OK
     xyz = hilly_scan()
     xyz[:300, 2], xyz[300:400] = np.nan, 0.0
     xyz[400:600, :2] = [500.0, 0.0]  # beyond the grid: no model
@@ -203,7 +202,7 @@ def test_model_reports_the_newest_scan():
         'Unknown fraction': '0.1000',
         'Points without a return': '400',
         'Optimiser status': fit.status,
-        'Learned since startup': '1',
+        'Learned since startup': '3',
         'Evaluations': str(fit.n_evaluations),
     }
     assert expected.items() <= values.items()
@@ -235,11 +234,11 @@ def test_a_scan_without_ground_is_a_warning(points):
 
 
 def test_output_lists_every_topic():
-    statistics = diagnostics.OutputTask()
-    assert statistics.report(0.0, {'/ground': 0}).message == 'nobody subscribes'
+    rates = {'/ground': Rate(), '/labeled': Rate()}
+    assert output_status(0.0, rates, {'/ground': 0}).message == 'nobody subscribes'
     for k in range(5):
-        statistics.published(0.2 * k, ['/ground'])
-    status = statistics.report(1.0, {'/ground': 2, '/labeled': 0})
+        rates['/ground'].count(0.2 * k)
+    status = output_status(1.0, rates, {'/ground': 2, '/labeled': 0})
     assert (status.level, status.message) == (Level.OK, 'subscribed to: /ground')
     facts = 'subscribers', 'rate (Hz)', 'since startup'
     expected = {'/ground': ('2', '5.00', '5'), '/labeled': ('0', 'unknown', '0')}
