@@ -141,6 +141,13 @@ def street(n_points, seed=0, n_invalid=0):
     return points
 
 
+def moved(points, xyz):
+    """Structured points at other coordinates (N, 3)."""
+    for k, axis in enumerate('xyz'):
+        points[axis] = xyz[:, k]
+    return points
+
+
 _CODES = ('i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'f4', 'f8')
 
 

@@ -44,10 +44,7 @@ def turned_street(yaw=0.0):
     """A street seen by a tilted sensor: structured points, and the rotation to the level frame."""
     points = street(6000)
     turn = Rotation.from_euler('z', yaw).as_matrix() @ rotation(*TILT)
-    xyz = xyz_of(points).astype(np.float64) @ turn
-    for k, axis in enumerate('xyz'):
-        points[axis] = xyz[:, k]
-    return points, turn
+    return ros.moved(points, xyz_of(points).astype(np.float64) @ turn), turn
 
 
 def check_levelled(points, message, parts):
@@ -217,9 +214,7 @@ def test_place_of_the_sensor_by_tf():
     """A room in the frame of a vehicle: which of its planes is the floor, the origin tells."""
     sensor = dataclasses.replace(VLP_16, n_columns=600, height=1.2)
     xyz = simulate_scan(ROOM, sensor, np.random.default_rng(0)).points[:, :3]
-    points = street(len(xyz))
-    for k, axis in enumerate('xyz'):
-        points[axis] = xyz[:, k] + (1.2 if axis == 'z' else 0.0)
+    points = ros.moved(street(len(xyz)), xyz + np.array([0.0, 0.0, 1.2]))
     values = {'learning.mode': 'fixed', 'frame.sensor': 'lidar', 'diagnostics.period': 0.1}
     with bench(*ros.given(values)) as b:
         message = to_message(points, stamp=(3, 4), frame='base_footprint')
