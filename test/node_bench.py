@@ -22,26 +22,13 @@ from gp_ground_seg.cli.options import progress
 from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_stamp
 from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
-from gp_ground_seg.lab.scoring.report import (
-    Column,
-    Table,
-    describe_environment,
-    machine_line,
-    milliseconds,
-)
+from gp_ground_seg.lab.scoring.report import describe_environment, machine_line
 from gp_ground_seg.ros.node_process import INPUT, OUTPUTS, Link, NodeProcess, private_session
 
 SILENCE = 2.0
 """Time without a cloud after which what is still missing is lost [s]."""
 N_SIMULATED = 10
-COUNTS = {'sent': 'n_sent', 'back': 'n_back', 'lost': 'n_lost', 'reported': 'n_dropped'}
-PERCENTILES = {'p50 [ms]': 'p50', 'p95': 'p95', 'p99': 'p99', 'worst': 'worst'}
-COLUMNS = [
-    Column('Rate [Hz]', 'g', 'asked'),
-    Column('sent [Hz]', '.2f', 'sent'),
-    *(Column(title, 'd', key) for title, key in COUNTS.items()),
-    *(milliseconds(title, key) for title, key in PERCENTILES.items()),
-]
+PERCENTILES = {50: 'p50 [ms]', 95: 'p95', 99: 'p99', 100: 'worst'}
 
 
 def dropped_by_node(session, arrays):
@@ -62,14 +49,11 @@ class Probe:
     def __init__(self, session):
         from sensor_msgs.msg import PointCloud2
 
-        from gp_ground_seg.ros.input import cloud_profile
-
         self._session, self._sent, self._back = session, {}, {}
-        self._publisher = session.node.create_publisher(PointCloud2, INPUT, cloud_profile(10))
+        self._publisher = session.publisher_of_clouds(INPUT, 10)
         for topic in OUTPUTS:
             take = partial(self._take, topic)
-            profile = cloud_profile(50)
-            session.node.create_subscription(PointCloud2, topic, take, profile, raw=True)
+            session.node.create_subscription(PointCloud2, topic, take, 50, raw=True)
 
     def _take(self, topic, raw, info):
         back = self._back.setdefault(stamp_of(decode_cloud(raw)), {})
@@ -79,7 +63,7 @@ class Probe:
         return sum(len(self._back.get(stamp, ())) == len(OUTPUTS) for stamp in self._sent)
 
     def send(self, clouds, rate, on_sent):
-        """Send clouds at a rate [Hz]; return counts, and percentiles of the latency [s]."""
+        """Send clouds at a rate [Hz]; return counts, and percentiles of the latency."""
         self._sent.clear()
         due = time.monotonic()
         for cloud in clouds:
@@ -98,21 +82,21 @@ class Probe:
         return self._result(rate)
 
     def _result(self, asked):
-        times = {stamp: self._back.get(stamp, {}) for stamp in self._sent}
         latency = [
-            1e-9 * (max(back.values()) - self._sent[stamp])
-            for stamp, back in times.items()
-            if len(back) == len(OUTPUTS)
+            1e-6 * (max(back.values()) - sent)
+            for stamp, sent in self._sent.items()
+            if len(back := self._back.get(stamp, {})) == len(OUTPUTS)
         ]
         first, *_, last = self._sent.values()
-        percents = np.percentile(latency, [50, 95, 99, 100]) if latency else [np.nan] * 4
-        return {
-            'asked': asked,
-            'sent': (len(self._sent) - 1) / (1e-9 * (last - first)),
-            'n_sent': len(self._sent),
-            'n_back': len(latency),
-            'n_lost': len(self._sent) - len(latency),
-            **dict(zip(('p50', 'p95', 'p99', 'worst'), percents, strict=True)),
+        n_sent, n_back = len(self._sent), len(latency)
+        row = {
+            'rate [Hz]': f'{asked:g}',
+            'sent [Hz]': f'{1e9 * (n_sent - 1) / (last - first):.2f}',
+        }
+        row |= {'sent': n_sent, 'back': n_back, 'lost': n_sent - n_back}
+        percents = np.percentile(latency, [*PERCENTILES]) if latency else [np.nan] * 4
+        return row | {
+            name: f'{p:.1f}' for name, p in zip(PERCENTILES.values(), percents, strict=True)
         }
 
 
@@ -144,7 +128,7 @@ def measure(clouds, rates, n_frames, ros_args=()):
             with progress(f'{rate:g} Hz')(total=n_frames) as bar:
                 found = probe.send(itertools.islice(stamped, n_frames), rate, bar.update)
             n_dropped = dropped_by_node(session, arrays) - before
-            results.append({**found, 'n_dropped': n_dropped})
+            results.append({**found, 'reported': n_dropped})
         node.check()
     return results
 
@@ -178,9 +162,9 @@ def main():
     clouds = [scan_cloud(points, 0, FRAME_ID) for points in scans]
     rates = measure(clouds, given.rates, given.frames, ros_args)
     n_points = sum(map(len, scans)) / len(scans)
-    title = f'{given.data or "simulated HDL-64E"}: {len(scans)} clouds of {n_points:.0f} points'
-    columns = {column: [rate[column.key] for rate in rates] for column in COLUMNS}
-    print(Table(columns, title).text())
+    print(f'{given.data or "simulated HDL-64E"}: {len(scans)} clouds of {n_points:.0f} points')
+    for row in ([*rates[0]], *(rate.values() for rate in rates)):
+        print(' '.join(f'{cell:>10}' for cell in row))
     print(machine_line(describe_environment()))
 
 

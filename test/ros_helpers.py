@@ -34,8 +34,8 @@ from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg.core.backend import choose_backend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
+from gp_ground_seg.ros.loader import CHANGED, FOLLOWS
 from gp_ground_seg.ros.node import GroundSegmentationNode, main
-from gp_ground_seg.ros.start_stop import CHANGED, FOLLOWS
 
 # Other tests run beside this one, also as workers of pytest-xdist; nothing of them must be heard.
 _WORKER = os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw')
@@ -141,14 +141,24 @@ def street(n_points, seed=0, n_invalid=0):
     return points
 
 
+def moved(points, xyz):
+    """Structured points at other coordinates (N, 3)."""
+    for k, axis in enumerate('xyz'):
+        points[axis] = xyz[:, k]
+    return points
+
+
+_CODES = ('i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'f4', 'f8')
+
+
 def to_message(points, stamp=(0, 0), frame=''):
     """Message of structured points."""
     message = PointCloud2(height=1, width=len(points), row_step=points.nbytes)
     message.header.stamp.sec, message.header.stamp.nanosec = stamp
     message.header.frame_id = frame
     message.fields = [
-        PointField(name=name, offset=offset, datatype=PointField.FLOAT32, count=1)
-        for name, (_, offset) in points.dtype.fields.items()
+        PointField(name=name, offset=offset, datatype=1 + _CODES.index(of.str[1:]), count=1)
+        for name, (of, offset) in points.dtype.fields.items()
     ]
     message.point_step = points.dtype.itemsize
     message.data = array('B', points.tobytes())

@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import argparse
+import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
+from gp_ground_seg.data.bag_files import POINT_CLOUD2
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_from_columns, encode_cloud
 from gp_ground_seg.data.point_cloud2 import CloudMessage
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
-from gp_ground_seg.ros.start_stop import large_cloud_transport, needing_ros, ros_session
-
-if TYPE_CHECKING:
-    from gp_ground_seg.ros.playback import Player
+from gp_ground_seg.ros.session import Session, large_cloud_transport, needing_ros, ros_session
 
 TOPIC = '/kitti/velo/pointcloud'
 FRAME_ID = 'velo_link'
 EPOCH = 1_316_995_200
 """Seconds of 2011-09-26 00:00 UTC, the day of KITTI's first drives; times.txt starts at 0."""
-SILENT_WAIT = 1.0
-"""Time without a subscriber after which a note says so [s]."""
+DEPTH = 100  # clouds kept until acknowledged: with stock Fast DDS that can take 3 s
+SLICE = 0.02  # longest wait in one piece [s]: /clock is published in between
+DISCOVERY_TIMEOUT = 2.0  # longest wait for the first subscribers [s]
+DELIVERY_TIMEOUT = 5.0  # longest wait for the last clouds [s]
+PAUSE = 0.1  # time in the bag from the last cloud of a round to the first of the next [s]
 
 CONVERT_DESCRIPTION = """\
 Write the scans of a SemanticKITTI sequence as a rosbag2.
@@ -45,22 +48,16 @@ CONVERT_EXAMPLES = """\
 """
 PLAY_DESCRIPTION = """\
 Publish the point clouds of a bag (ROS 1 .bag, rosbag2 folder, .mcap, .db3) on
-their topic, byte for byte, at the times they were recorded.
+their topics, byte for byte, at the times they were recorded. It begins when each
+topic has a subscriber, after 2 s at the latest.
 
-Offered reliably: a reliable subscriber gets every cloud. Waits for a subscriber
-before it starts. Only PointCloud2 topics are played; for TF and the rest use
-`ros2 bag play`.
-
-A slow subscriber may lose clouds that its middleware acknowledged: its own
-/diagnostics have their number.
+For TF and other topics, a choice of topics, remapped QoS or a start in the middle
+use `ros2 bag play`.
 """
 PLAY_EXAMPLES = """\
   gp-ground-seg play drive.mcap
   gp-ground-seg play drive.mcap --clock --rate 0.5
   gp-ground-seg play drive.mcap --loop --ros-args -r /kitti/velo/pointcloud:=/points
-
-exit code: 0, 1 if clouds were not acknowledged (always 0 with --no-wait), 2 for an error, 130
-when interrupted
 """
 
 
@@ -86,9 +83,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
          {'metavar': 'R', 'type': options.above_zero, 'default': 1.0}),
         ('--loop', 'begin again at the end, until Ctrl-C', options.FLAG),
         ('--clock', "publish the bag's time on /clock, 50 Hz (for use_sim_time)", options.FLAG),
-        ('--topic', 'PointCloud2 topic to play (may be repeated; default: the only one)',
-         {'metavar': 'T', 'action': 'append'}),
-        ('--no-wait', 'start at once, with or without a subscriber', options.FLAG),
         options.QUIET,
     )  # fmt: skip
     parser.set_defaults(run=run_play, accepts_ros_args=True)
@@ -144,38 +138,63 @@ def _nanoseconds(frame: Frame) -> int:
 
 def run_play(arguments: argparse.Namespace) -> int:
     """Play the bag."""
-    with needing_ros('play'):
-        from gp_ground_seg.ros.playback import Player, PlayOptions
-
-    how = PlayOptions(arguments.rate, arguments.loop, arguments.clock)
-    with BagReader(arguments.bag) as bag:
-        chosen = dict.fromkeys(arguments.topic or [None])
-        topics = [bag.pick_point_cloud_topic(name) for name in chosen]
-        others = [f'{name} ({kind})' for name, kind in bag.topics.items() if name not in topics]
-        if others and not arguments.quiet:
-            options.note(f'not played: {", ".join(others)}')
-        n_clouds = sum(bag.n_messages(topic) for topic in topics)
-        with large_cloud_transport(), ros_session('bag_player', arguments.ros_args) as session:
-            player = Player(session.node, bag, topics, session.sleep, how)
-            if not arguments.no_wait:
-                _wait_for_subscribers(player, quiet=arguments.quiet)
-            try:
-                # With --loop there is no end to show progress towards, only a count.
-                total = 0 if arguments.loop else n_clouds
-                with options.progress('play', quiet=arguments.quiet)(total=total) as bar:
-                    player.play(bar.update)
-            finally:
-                # After an interrupt, too: with --loop it is the only end.
-                if summary := player.summary():
-                    print(summary, flush=True)
-    if not player.is_acknowledged:
-        options.note('not every reliable subscriber has acknowledged all clouds')
-    return 0 if player.is_acknowledged or arguments.no_wait else 1
+    with needing_ros('play'), BagReader(arguments.bag) as bag:
+        counts = {t: bag.n_messages(t) for t, kind in bag.topics.items() if kind == POINT_CLOUD2}
+        topics = [topic for topic, n in counts.items() if n] or [bag.pick_point_cloud_topic()]
+        # With --loop there is no end to show progress towards, only a count.
+        total = 0 if arguments.loop else sum(counts.values())
+        with (
+            large_cloud_transport(),
+            ros_session('bag_player', arguments.ros_args) as session,
+            options.progress('play', quiet=arguments.quiet)(total=total) as bar,
+        ):
+            player = Player(session, topics, arguments.rate, has_clock=arguments.clock)
+            start = player.play(bag, time.monotonic(), bar.update)
+            while arguments.loop:
+                start = player.play(bag, start, bar.update)
+            player.wait_until_delivered()
+    return 0
 
 
-def _wait_for_subscribers(player: Player, *, quiet: bool) -> None:
-    if not (player.wait_for_subscribers(SILENT_WAIT) or quiet):
-        options.note(
-            f'waiting for a subscriber of {", ".join(player.topics_without_subscriber())}'
+class Player:
+    """Publishes the clouds of `topics`, `rate` times as fast as they were recorded."""
+
+    def __init__(
+        self, session: Session, topics: list[str], rate: float, *, has_clock: bool
+    ) -> None:
+        self._session, self._rate = session, rate
+        self._publishers = {t: session.publisher_of_clouds(t, DEPTH) for t in topics}
+        self._tell_time = session.publisher_of_time() if has_clock else None
+        publishers = self._publishers.values()
+        session.wait_for(
+            lambda: all(p.get_subscription_count() for p in publishers), DISCOVERY_TIMEOUT
         )
-    player.wait_for_subscribers()
+
+    def play(self, bag: BagReader, start: float, on_cloud: Callable[[], object]) -> float:
+        """Play the bag from the monotonic time `start` on; return when the next round starts."""
+        first: int | None = None
+        elapsed = 0  # in the bag [ns]
+        for topic, recorded, raw in bag.messages(self._publishers):
+            if first is None:
+                first, start = recorded, max(start, time.monotonic())
+            # The parts of a split bag may overlap.
+            elapsed = max(elapsed, recorded - first)
+            self._wait_until(start + 1e-9 * elapsed / self._rate, first + elapsed)
+            self._publishers[topic].publish(raw)
+            on_cloud()
+        return start + (1e-9 * elapsed + PAUSE) / self._rate
+
+    def _wait_until(self, due: float, recorded: int) -> None:
+        """Wait until a monotonic time [s]; at it, the time of the bag is `recorded` [ns]."""
+        while True:
+            left = max(0.0, due - time.monotonic())
+            if self._tell_time is not None:
+                self._tell_time(recorded - round(1e9 * left * self._rate))
+            self._session.sleep(min(SLICE, left))
+            if not left:
+                return
+
+    def wait_until_delivered(self) -> None:
+        """Wait until the last clouds are acknowledged: with the publisher they would be lost."""
+        for publisher in self._publishers.values():
+            self._session.wait_until_delivered(publisher, DELIVERY_TIMEOUT)

@@ -25,10 +25,10 @@ from gp_ground_seg.lab.plotting import new_figure, plot_scan_view
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_labels, label_ratios
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
 from gp_ground_seg.ros.node_process import GROUND, OBSTACLES, Link, NodeProcess, private_session
-from gp_ground_seg.ros.start_stop import needing_ros
+from gp_ground_seg.ros.session import needing_ros
 
 if TYPE_CHECKING:
-    from gp_ground_seg.ros.start_stop import Session
+    from gp_ground_seg.ros.session import Session
 
 BAG, PICTURE, LOG = 'drive.mcap', 'scan.png', 'node.log'
 TOPIC = '/points'  # of the bag

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
-import threading
 import time
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import GroundSegError, MissingDependencyError, install_hint, shown
-from gp_ground_seg.ros.start_stop import run_node
+from gp_ground_seg.ros.node_process import run_node
 
 NODE_EXAMPLES = """\
   gp-ground-seg node
@@ -55,37 +54,17 @@ def main_managed() -> int:
 def run_warm_up(_arguments: argparse.Namespace) -> int:
     """Compile all code that a frame needs, in this process."""
     from gp_ground_seg.core.jit import HAVE_NUMBA, code_folder
+    from gp_ground_seg.core.segmenter import warm_up
 
     if not HAVE_NUMBA:
         raise MissingDependencyError(
             f'numba is not installed, nothing to compile: {install_hint("numba")}'
         )
+    options.note('compiling what is not on disk yet: 20 to 60 s for all of it')
     begin = time.monotonic()
-    _compile()
+    warm_up()
     seconds, folder = time.monotonic() - begin, code_folder()
     if folder is None:
         raise GroundSegError('compiled code is not kept on disk, see the note above')
     print(f'compiled code is kept in {folder}; it was there after {seconds:.1f} s')
     return 0
-
-
-def _compile() -> None:
-    """Compile, and show meanwhile how many functions are ready."""
-    import gp_ground_seg.core.compiled.backend  # noqa: F401 - it declares the functions
-    from gp_ground_seg.core.jit import count_ready
-    from gp_ground_seg.core.segmenter import warm_up
-
-    is_done = threading.Event()
-    with options.progress('compiling', unit='function')(total=count_ready()[1]) as bar:
-
-        def watch() -> None:
-            while not is_done.wait(0.2):
-                bar.update(count_ready()[0] - bar.n)
-
-        watcher = threading.Thread(target=watch)
-        watcher.start()
-        try:
-            warm_up()
-        finally:
-            is_done.set()
-            watcher.join()

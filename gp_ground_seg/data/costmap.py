@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -41,13 +41,6 @@ Ranges = npt.NDArray[np.float32]
 Places = tuple[PointArray, PointArray]
 
 
-class Placement(NamedTuple):
-    """Where the frame of the outputs is: it has the point p of the cloud at R p + t."""
-
-    rotation: FloatArray  # R, (3, 3)
-    translation: FloatArray  # t, (3,) [m]
-
-
 @dataclass(frozen=True, eq=False)
 class SegmentedCloud:
     """A cloud with its labels, and what of it is published under the parameters ``output``.
@@ -60,26 +53,19 @@ class SegmentedCloud:
         Its labels.
     config : Config
         Parameters.
-    placement : Placement or None
-        Where ``output.frame`` is; None if it is the frame of the cloud.
+    xyz : array (N, 3) or None
+        Coordinates of all points [m], where they have been read already.
     """
 
     cloud: Any
     segmentation: Segmentation
     config: Config
-    placement: Placement | None = None
+    xyz: PointArray | None = None
 
     @cached_property
     def points(self) -> PointArray:
         """Coordinates of all points in the frame of the cloud, (N, 3) [m]."""
-        return read_xyz(self.cloud)
-
-    @property
-    def frame_id(self) -> str:
-        """Frame of what is published."""
-        return (
-            str(self.cloud.header.frame_id) if self.placement is None else self.config.output.frame
-        )
+        return read_xyz(self.cloud) if self.xyz is None else self.xyz
 
     @cached_property
     def is_ground(self) -> BoolArray:
@@ -101,17 +87,8 @@ class SegmentedCloud:
             chosen &= ~(height > output.max_height)
         return chosen
 
-    @property
-    def offset(self) -> tuple[float, float]:
-        """Where the origin of the cloud is in the plane of the output frame [m]."""
-        x, y = (0.0, 0.0) if self.placement is None else self.placement.translation[:2].tolist()
-        return x, y
-
     def places(self, chosen: BoolArray) -> Places:
-        """Places of the `chosen` points, (N,) bool, in the output frame, seen from `offset`.
-
-        Without an output frame, where verticals through them meet z = 0 of the cloud.
-        """
+        """Places of the `chosen` points, (N,) bool: their verticals meet z = 0 of the cloud."""
         index = np.flatnonzero(chosen)
         return self._in_plane(*(values.take(index) for values in self.points.T))
 
@@ -147,29 +124,19 @@ class SegmentedCloud:
 
     def _in_plane(self, x: PointArray, y: PointArray, z: PointArray) -> Places:
         """Places of points of the cloud, (n,) each, as `places` gives them."""
-        with np.errstate(over='ignore', invalid='ignore'):
-            x, y = (a * x + b * y + c * z for a, b, c in self._to_plane().tolist())
-        return x, y
-
-    def _to_plane(self) -> FloatArray:
-        """Matrix (2, 3) from the cloud to the plane of the map."""
-        if self.placement is not None:
-            return self.placement.rotation[:2]
-        x, y, z = self.segmentation.pose.rotation[2].tolist()
-        if abs(z) < LEAST_COSINE:
+        up_x, up_y, up_z = self.segmentation.pose.rotation[2].tolist()
+        if abs(up_z) < LEAST_COSINE:
             raise PointCloudError(
-                'the z axis of the cloud is level, so its plane is no map: output.frame must be a '
-                'level frame while somebody listens to scan or occupancy'
+                'the z axis of the cloud is level, so its plane is no map: transform the cloud '
+                'into a level frame, or leave scan and occupancy without subscribers'
             )
-        return np.array([[1.0, 0.0, -x / z], [0.0, 1.0, -y / z]])
+        with np.errstate(over='ignore', invalid='ignore'):
+            return x - up_x / up_z * z, y - up_y / up_z * z
 
     @property
     def heading(self) -> FloatArray:
         """Matrix (2, 2) from directions of the map to those of the level frame of the surface."""
-        turn = self.segmentation.pose.rotation
-        if self.placement is not None:
-            turn = turn @ self.placement.rotation.T
-        return turn[:2, :2]
+        return self.segmentation.pose.rotation[:2, :2]
 
 
 def direction_of(x: PointArray, y: PointArray) -> npt.NDArray[np.int16]:

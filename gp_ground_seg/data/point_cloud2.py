@@ -106,17 +106,6 @@ def read_fields(cloud: CloudMessage) -> npt.NDArray[np.void]:
     return points.astype(repack_fields(dtype.newbyteorder('=')))
 
 
-def write_xyz(cloud: CloudMessage, xyz: npt.NDArray[np.floating]) -> None:
-    """Put coordinates, (height * width, 3), in place of those of every point.
-
-    The data must be writable. Raises PointCloudError as `read_xyz` does.
-    """
-    if cloud.height * cloud.width:
-        with np.errstate(over='ignore'):
-            for column, values in zip(_views(cloud, 'xyz', _FLOATS).values(), xyz.T, strict=True):
-                column[...] = values.reshape(column.shape)
-
-
 def append_columns(
     cloud: CloudMessage, columns: Mapping[str, npt.NDArray[Any]]
 ) -> tuple[list[tuple[str, int, int]], int, npt.NDArray[np.uint8]]:

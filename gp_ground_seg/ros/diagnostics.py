@@ -39,6 +39,11 @@ class Status(NamedTuple):
     values: dict[str, str]
 
 
+def judged(task: str, faults: Sequence[str], good: str, values: dict[str, str]) -> Status:
+    """Return a WARN with all `faults`; without any, OK with the message `good`."""
+    return Status(task, Level.WARN if faults else Level.OK, '; '.join(faults) or good, values)
+
+
 class Rate:
     """Events in all, and in the last `RATE_WINDOW` seconds."""
 
@@ -86,15 +91,16 @@ class InputTask:
         self._frame = self._fields = self._last_error = ''
         self._stamp: float | None = None
 
-    def arrived(self, now: float, stamp: float, frame: str, fields: Sequence[str]) -> None:
-        """Count a cloud; `stamp` is the time in its header [s]."""
+    def arrived(self, now: float, cloud: PointCloud2) -> None:
+        """Count a cloud."""
         if self._is_reported:
             self._n_recent = self._n_refused_recent = 0
         self._is_reported = False
         self._n_recent += 1
         self._last_arrival = now
         self._arrivals.count(now)
-        self._stamp, self._frame, self._fields = stamp, frame, ' '.join(fields)
+        self._stamp, self._frame = seconds_of(cloud.header.stamp), cloud.header.frame_id
+        self._fields = ' '.join(field.name for field in cloud.fields)
 
     def refused(self, reason: str) -> None:
         """Count the cloud that arrived last as one that could not be processed."""
@@ -139,20 +145,19 @@ class InputTask:
         if facts.idle:
             return Level.OK, f'not listening to {facts.topic}: {facts.idle}'
         if silence > stale_after:
-            source = (
-                f'publishers: {facts.n_publishers}'
-                if facts.n_publishers
-                else 'nobody sends clouds'
-            )
-            why = f'; {facts.fault}' if facts.fault else ''
-            return Level.STALE, f'no cloud on {facts.topic} for {silence:.1f} s ({source}){why}'
+            n = facts.n_publishers
+            source = f'publishers: {n}' if n else 'nobody sends clouds'
+            said = f'no cloud on {facts.topic} for {silence:.1f} s ({source})'
+            return Level.STALE, f'{said}; {facts.fault}' if facts.fault else said
+        if n_refused:
+            every = n_refused == n_received
+            share = 'every cloud' if every else f'{n_refused} of {n_received} clouds'
+            return Level.ERROR, f'{share} refused: {self._last_error}'
         # A stamp may be of any age: a recording is played at any time.
-        if n_refused == 0:
-            waiting = f'waiting for the first cloud on {facts.topic}'
-            found = Level.OK, 'receiving' if n_received else waiting
-            return (Level.WARN, facts.fault) if facts.fault else found
-        share = 'every cloud' if n_refused == n_received else f'{n_refused} of {n_received} clouds'
-        return Level.ERROR, f'{share} refused: {self._last_error}'
+        if facts.fault:
+            return Level.WARN, facts.fault
+        waiting = f'waiting for the first cloud on {facts.topic}'
+        return Level.OK, 'receiving' if n_received else waiting
 
 
 class ProcessingTask:
@@ -162,6 +167,7 @@ class ProcessingTask:
         # Of the newest clouds, from arrival to publication [s].
         self._latencies: deque[float] = deque(maxlen=CLOUD_WINDOW)
         self._n_processed = self._n_dropped = 0
+        # Since the last report.
         self._n_sent_recent = self._n_dropped_recent = 0
         self._backend = ''
 
@@ -179,82 +185,67 @@ class ProcessingTask:
 
     def report(self, limits: DiagnosticsConfig) -> Status:
         """Judge the latest clouds, and the losses since the last report."""
-        latency = float(np.median(self._latencies)) if self._latencies else None
+        latency = 1e3 * float(np.median(self._latencies)) if self._latencies else None
+        limit, n_dropped = 1e3 * limits.max_latency, self._n_dropped_recent
+        faults = []
+        if latency is not None and latency > limit:
+            faults.append(f'median latency {latency:.0f} ms, above {limit:g} ms')
+        if n_dropped:
+            faults.append(
+                f'{n_dropped} of {self._n_sent_recent} clouds dropped since the last report'
+            )
+        self._n_sent_recent = self._n_dropped_recent = 0
+        good = 'no cloud processed yet' if latency is None else f'median latency {latency:.1f} ms'
         values = {
             'Clouds since startup': str(self._n_processed),
             'Dropped since startup': str(self._n_dropped),
-            'Median latency (ms)': _digits(None if latency is None else 1e3 * latency, '.2f'),
+            'Median latency (ms)': _digits(latency, '.2f'),
             'Backend': self._backend,
         }
-        found = self._judge(latency, limits)
-        self._n_sent_recent = self._n_dropped_recent = 0
-        return Status('processing', *found, values)
-
-    def _judge(self, latency: float | None, limits: DiagnosticsConfig) -> Finding:
-        n_dropped, faults = self._n_dropped_recent, []
-        if latency is not None and latency > limits.max_latency:
-            limit = 1e3 * limits.max_latency
-            faults.append(f'median latency {1e3 * latency:.0f} ms, above {limit:g} ms')
-        if n_dropped:
-            n_sent = self._n_sent_recent
-            faults.append(f'{n_dropped} of {n_sent} clouds dropped since the last report')
-        if faults:
-            return Level.WARN, '; '.join(faults)
-        if latency is None:
-            return Level.OK, 'no cloud processed yet'
-        return Level.OK, f'median latency {1e3 * latency:.1f} ms'
+        return judged('processing', faults, good, values)
 
 
-class ModelTask:
-    """The newest scan; its statistics are computed for a report only."""
-
-    _newest: Segmentation | None = None
-    _n_learned = 0
-
-    def segmented(self, segmentation: Segmentation) -> None:
-        """Keep a scan."""
-        self._newest = segmentation
-        self._n_learned += segmentation.fit.n_evaluations > 0
-
-    def report(self) -> Status:
-        """Judge the newest scan."""
-        scan = self._newest
-        if scan is None:
-            return Status('model', Level.OK, 'no cloud segmented yet', {})
-        fit, label = scan.fit, scan.label
-        has_model = np.isfinite(scan.labelled.height)
-        without_model = _mean(~has_model & (label != Label.UNKNOWN))
-        per_candidate = fit.n_inliers / fit.n_candidates if fit.n_candidates else np.nan
-        values = {
-            'Segments with a model': f'{fit.n_segments} of {len(scan.surface.mean)}',
-            'Ground fraction': _digits(_mean(label == Label.GROUND), '.4f'),
-            'Unknown fraction': _digits(_mean(label == Label.UNKNOWN), '.4f'),
-            'Points without a return': str(np.count_nonzero(label == Label.UNKNOWN)),
-            'Fraction without model': _digits(without_model, '.4f'),
-            'Candidates': str(fit.n_candidates),
-            'Inliers': str(fit.n_inliers),
-            **_pose_values(scan.pose),
-            'Noise (m)': _digits(fit.theta.get('sigma_n'), '.4g'),
-            'Learning mode': fit.mode,
-            'Learned since startup': str(self._n_learned),
-            'Optimiser status': fit.status,
-            'Evaluations': str(fit.n_evaluations),
-            'At bound': ' '.join(fit.at_bound) or 'none',
-            'Objective per candidate': _digits(fit.objective * per_candidate, '.4f'),
-            **{f'theta {name}': f'{value:.4g}' for name, value in fit.theta.items()},
-        }
-        return Status('model', *_judge_model(scan), values)
+def model_status(scan: Segmentation | None, n_learned: int) -> Status:
+    """Judge the newest scan; from `n_learned` scans hyper-parameters were learned."""
+    if scan is None:
+        return Status('model', Level.OK, 'no cloud segmented yet', {})
+    fit, label = scan.fit, scan.label
+    has_model = np.isfinite(scan.labelled.height)
+    without_model = _mean(~has_model & (label != Label.UNKNOWN))
+    per_candidate = fit.n_inliers / fit.n_candidates if fit.n_candidates else np.nan
+    values = {
+        'Segments with a model': f'{fit.n_segments} of {len(scan.surface.mean)}',
+        'Ground fraction': _digits(_mean(label == Label.GROUND), '.4f'),
+        'Unknown fraction': _digits(_mean(label == Label.UNKNOWN), '.4f'),
+        'Points without a return': str(np.count_nonzero(label == Label.UNKNOWN)),
+        'Fraction without model': _digits(without_model, '.4f'),
+        'Candidates': str(fit.n_candidates),
+        'Inliers': str(fit.n_inliers),
+        **_pose_values(scan.pose),
+        'Noise (m)': _digits(fit.theta.get('sigma_n'), '.4g'),
+        'Learning mode': fit.mode,
+        'Learned since startup': str(n_learned),
+        'Optimiser status': fit.status,
+        'Evaluations': str(fit.n_evaluations),
+        'At bound': ' '.join(fit.at_bound) or 'none',
+        'Objective per candidate': _digits(fit.objective * per_candidate, '.4f'),
+        **{f'theta {name}': f'{value:.4g}' for name, value in fit.theta.items()},
+    }
+    return judged('model', _faults_of(scan), 'ground found in the newest cloud', values)
 
 
-def _judge_model(scan: Segmentation) -> Finding:
-    doubtful = (*scan.pose.contradictions, *_pose_warnings(scan))
-    if doubtful:
-        return Level.WARN, '; '.join(doubtful)
+def _faults_of(scan: Segmentation) -> list[str]:
+    """Return doubts of the pose that was used; without any, why there is no good model."""
+    pose = scan.pose
+    faults = [*pose.contradictions]
+    if scan.label.any():  # an empty cloud shows nothing of the pose
+        faults += [kept_height(pose)] if pose.is_fallback else pose.warnings
+    if faults:
+        return faults
     if not scan.fit.n_segments:
-        return Level.WARN, 'no ground found in the newest cloud'
-    if scan.fit.status == 'failed':
-        return Level.WARN, 'the hyper-parameters could not be learned'
-    return Level.OK, 'ground found in the newest cloud'
+        return ['no ground found in the newest cloud']
+    is_failed = scan.fit.status == 'failed'
+    return ['the hyper-parameters could not be learned'] if is_failed else []
 
 
 def kept_height(pose: SensorPose) -> str:
@@ -263,13 +254,6 @@ def kept_height(pose: SensorPose) -> str:
         'the cloud does not show the ground near the sensor well: the height of '
         f'{pose.height:.2f} m of an earlier one is kept; set sensor.height'
     )
-
-
-def _pose_warnings(scan: Segmentation) -> tuple[str, ...]:
-    """Warnings of the pose used; an empty cloud has none."""
-    if not scan.label.any():
-        return ()
-    return (kept_height(scan.pose),) if scan.pose.is_fallback else scan.pose.warnings
 
 
 def _pose_values(pose: SensorPose) -> dict[str, str]:
@@ -288,27 +272,18 @@ def _pose_values(pose: SensorPose) -> dict[str, str]:
     }
 
 
-class OutputTask:
-    """Messages per topic."""
-
-    def __init__(self) -> None:
-        self._rates: defaultdict[str, Rate] = defaultdict(Rate)
-
-    def published(self, now: float, topics: Sequence[str]) -> None:
-        """Count one message on each of the `topics`."""
-        for topic in topics:
-            self._rates[topic].count(now)
-
-    def report(self, now: float, n_subscribers: Mapping[str, int]) -> Status:
-        """List all topics, with their subscribers."""
-        values = {}
-        for topic, n in n_subscribers.items():
-            values[f'{topic} subscribers'] = str(n)
-            values[f'{topic} rate (Hz)'] = _digits(self._rates[topic].window(now)[2], '.2f')
-            values[f'{topic} since startup'] = str(self._rates[topic].n_total)
-        heard = [topic for topic, n in n_subscribers.items() if n]
-        message = f'subscribed to: {", ".join(heard)}' if heard else 'nobody subscribes'
-        return Status('output', Level.OK, message, values)
+def output_status(
+    now: float, rates: Mapping[str, Rate], n_subscribers: Mapping[str, int]
+) -> Status:
+    """List all topics, with their subscribers, and the rates of their messages."""
+    values = {}
+    for topic, n in n_subscribers.items():
+        values[f'{topic} subscribers'] = str(n)
+        values[f'{topic} rate (Hz)'] = _digits(rates[topic].window(now)[2], '.2f')
+        values[f'{topic} since startup'] = str(rates[topic].n_total)
+    heard = ', '.join(topic for topic, n in n_subscribers.items() if n)
+    good = f'subscribed to: {heard}' if heard else 'nobody subscribes'
+    return judged('output', [], good, values)
 
 
 State = tuple[InputFacts, Mapping[str, int]]
@@ -320,7 +295,10 @@ class Diagnostics:
 
     def __init__(self, node: Node, state: Callable[[], State], limits: DiagnosticsConfig) -> None:
         self.input = InputTask(time.monotonic())
-        self.processing, self.model, self.output = ProcessingTask(), ModelTask(), OutputTask()
+        self.processing = ProcessingTask()
+        self._newest: Segmentation | None = None  # its statistics are computed for a report only
+        self._n_learned = 0
+        self._rates: defaultdict[str, Rate] = defaultdict(Rate)  # of the output topics
         self._node, self._state, self._limits = node, state, limits
         self._next_log, self._n_logged = np.inf, '0'
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -335,8 +313,7 @@ class Diagnostics:
 
     def arrived(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
         """Count a cloud that came at the time `arrival` [s], and `n_lost` before it."""
-        fields = [field.name for field in cloud.fields]
-        self.input.arrived(arrival, seconds_of(cloud.header.stamp), cloud.header.frame_id, fields)
+        self.input.arrived(arrival, cloud)
         self.processing.arrived(n_lost)
 
     def published(
@@ -351,8 +328,10 @@ class Diagnostics:
         times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
         self._node.get_logger().debug(f'times of the stages [ms]: {times}')
         self.processing.processed(now - arrival, scan.fit.backend)
-        self.model.segmented(scan)
-        self.output.published(now, topics)
+        self._newest = scan
+        self._n_learned += scan.fit.n_evaluations > 0
+        for topic in topics:
+            self._rates[topic].count(now)
 
     def report(self, now: float) -> list[Status]:
         """Return the status of each task."""
@@ -360,8 +339,8 @@ class Diagnostics:
         found = [
             self.input.report(now, facts, self._limits),
             self.processing.report(self._limits),
-            self.model.report(),
-            self.output.report(now, n_subscribers),
+            model_status(self._newest, self._n_learned),
+            output_status(now, self._rates, n_subscribers),
         ]
         self._log(now, {name: text for status in found for name, text in status.values.items()})
         return found

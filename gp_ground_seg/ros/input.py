@@ -20,7 +20,6 @@ from gp_ground_seg.core.errors import ConfigError
 
 CLOUD_TYPE = 'sensor_msgs/msg/PointCloud2'
 INPUT_DEPTH = 1  # clouds that may wait to be processed: the newest, which is worth most
-OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 0.7 s only
 MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
 LARGE_CLOUD = 500_000  # size up to which stock Fast DDS loses no best-effort cloud [bytes]
@@ -111,7 +110,7 @@ class CloudSubscription:
     """Why no clouds are wanted, as of the last review."""
     _subscription: Any = None
     _reliability = ReliabilityPolicy.UNKNOWN
-    _large_size = 0
+    _fault_of_types = _fault_of_size = ''
 
     def __init__(
         self,
@@ -154,28 +153,10 @@ class CloudSubscription:
     @property
     def fault(self) -> str:
         """What is wrong with the way clouds are received; empty if nothing."""
-        found = [self._fault_of_types] if self._foreign else []
         is_refused = ReliabilityPolicy.BEST_EFFORT in self._offered.values()
-        if self._is_pinned and self._reliability == ReliabilityPolicy.RELIABLE and is_refused:
-            found.append(NOTHING_ARRIVES)
-        elif self._large_size:
-            found.append(self._fault_of_size)
-        return '; '.join(found)
-
-    @property
-    def _fault_of_types(self) -> str:
-        return (
-            f'{" and ".join(sorted(self._foreign))} is sent there, and {CLOUD_TYPE} is wanted: '
-            'remap points to a topic of that type, or have the driver send it'
-        )
-
-    @property
-    def _fault_of_size(self) -> str:
-        return (
-            f'clouds of {self._large_size / 1e6:.1f} MB come best-effort, of which Fast DDS may '
-            'lose most: let their publisher offer reliable, or start it with '
-            'FASTRTPS_DEFAULT_PROFILES_FILE=config/fastdds_large_clouds.xml'
-        )
+        is_pinned = self._is_pinned and self._reliability == ReliabilityPolicy.RELIABLE
+        other = NOTHING_ARRIVES if is_pinned and is_refused else self._fault_of_size
+        return '; '.join(filter(None, (self._fault_of_types, other)))
 
     def _create(self) -> None:
         self._subscription = self._node.create_subscription(
@@ -207,7 +188,11 @@ class CloudSubscription:
 
     def _check_size(self, size: int) -> None:
         if size > LARGE_CLOUD:
-            self._large_size = size
+            self._fault_of_size = (
+                f'clouds of {size / 1e6:.1f} MB come best-effort, of which Fast DDS may lose '
+                'most: let their publisher offer reliable, or start it with '
+                'FASTRTPS_DEFAULT_PROFILES_FILE=config/fastdds_large_clouds.xml'
+            )
             self._node.get_logger().warning(f'on {self.topic}, {self._fault_of_size}', once=True)
 
     def _on_incompatible(self, _event: object) -> None:
@@ -225,6 +210,12 @@ class CloudSubscription:
             for entry in entries
             if entry.topic_type == CLOUD_TYPE
         }
+        self._fault_of_types = ''
+        if self._foreign:
+            self._fault_of_types = (
+                f'{" and ".join(sorted(self._foreign))} is sent there, and {CLOUD_TYPE} is '
+                'wanted: remap points to a topic of that type, or have the driver send it'
+            )
         if self._foreign - foreign:
             self._node.get_logger().warning(f'on {self.topic}, {self._fault_of_types}')
         is_changed = self._offered.keys() != before
@@ -249,17 +240,12 @@ class CloudSubscription:
             return
         if is_listening:
             self._end()
-        self._reliability, self._large_size = wanted, 0
+        self._reliability, self._fault_of_size = wanted, ''
         words = f'not listening to {self.topic}: {self.idle}'
         if not self.idle:
             self._create()
             words = f'listening to {self.topic} ({self.qos_words})'
         self._node.get_logger().info(words)
-
-
-def cloud_profile(depth: int = OUTPUT_DEPTH) -> QoSProfile:
-    """Return the default of a topic on which clouds are sent: reliable, volatile, the newest."""
-    return QoSProfile(depth=depth)
 
 
 def seconds_of(stamp: TimeMessage) -> float:

@@ -34,12 +34,13 @@ from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
-from gp_ground_seg.ros import start_stop
+from gp_ground_seg.ros.arguments import initialize, start_errors, unused_files, with_file
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts, kept_height
 from gp_ground_seg.ros.input import STEADY_CLOCK, THROTTLED, CloudSubscription, clock_fault
+from gp_ground_seg.ros.loader import CHANGED, FOLLOWS, STAYS, BackendLoader
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
-from gp_ground_seg.ros.start_stop import CHANGED, FOLLOWS, STAYS, BackendLoader
+from gp_ground_seg.ros.session import StopRequest, large_cloud_transport, stop_on_signals
 from gp_ground_seg.ros.transforms import (
     CloudFrames,
     FrameListener,
@@ -95,7 +96,7 @@ class GroundSegmentationNode(ConfiguredNode):
     def _start(self) -> None:
         logger = self.get_logger()
         logger.info(describe(self.config, self.get_fully_qualified_name()))
-        with start_stop.start_errors():
+        with start_errors():
             self._outputs = OutputPublishers(self)
             self._input = CloudSubscription(
                 self, 'points', self._on_cloud, self._why_idle, self._on_time_jump
@@ -127,9 +128,7 @@ class GroundSegmentationNode(ConfiguredNode):
                 text = f'on {self._input.topic}, {kept_height(result.pose)}'
                 self.get_logger().warning(text, **THROTTLED)
             segmented = time.monotonic()
-            topics = self._outputs.publish(
-                SegmentedCloud(cloud, result, self.config, frames.output)
-            )
+            topics = self._outputs.publish(SegmentedCloud(cloud, result, self.config, points))
         except Exception as error:
             # The next cloud may be good.
             self._refuse(cloud, error)
@@ -200,8 +199,7 @@ class GroundSegmentationNode(ConfiguredNode):
     def _follow_frames(self, config: Config) -> None:
         """Listen to TF and IMU while the parameters ask for it; clouds wait for them then."""
         before = self._frames.config if self._frames else Config()
-        is_same = (config.frame, config.output.frame) == (before.frame, before.output.frame)
-        if self._frames is not None and not is_same:
+        if self._frames is not None and config.frame != before.frame:
             self._frames.close()
             self._frames = None
         if self._frames is None and is_listening(config):
@@ -253,7 +251,7 @@ class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[m
     _is_configured = _is_active = False
     _heartbeat: Heartbeat | None = None
 
-    def __init__(self, stop: start_stop.StopRequest, **options: Any) -> None:
+    def __init__(self, stop: StopRequest, **options: Any) -> None:
         self._stop = stop
         GroundSegmentationNode.__init__(self, **options)
         LifecycleNodeMixin.__init__(self)
@@ -365,7 +363,7 @@ class Heartbeat:
         self._node.destroy_publisher(self._publisher)
 
 
-def _spin(node: GroundSegmentationNode, stop: start_stop.StopRequest) -> None:
+def _spin(node: GroundSegmentationNode, stop: StopRequest) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while rclpy.ok() and not stop.made:
@@ -385,17 +383,17 @@ def main(args: Sequence[str] | None = None, *, is_managed: bool = False) -> int:
     """Run a node until a signal or a shutdown; return 0, or 2 for an error at start."""
     words = [NODE_NAME, *(sys.argv[1:] if args is None else args)]
     node = None
-    with start_stop.stop_on_signals() as stop:
+    with stop_on_signals() as stop:
         try:
             # Both outputs at once are more than stock Fast DDS sends without loss.
-            with start_stop.large_cloud_transport():
-                start_stop.initialize(words)
+            with large_cloud_transport():
+                initialize(words)
                 node = ManagedNode(stop) if is_managed else GroundSegmentationNode()
-            for line in start_stop.unused_files(words, node.get_fully_qualified_name()):
+            for line in unused_files(words, node.get_fully_qualified_name()):
                 node.get_logger().warning(line)
             _spin(node, stop)
         except GroundSegError as error:
-            problem = start_stop.with_file(str(error), words)
+            problem = with_file(str(error), words)
             sys.stderr.write(f'{NODE_NAME}: error: {shown(problem)}\n')
             return 2
         finally:

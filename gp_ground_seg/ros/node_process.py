@@ -1,6 +1,6 @@
-"""A node in a second process, and clouds sent to it.
+"""The node as a process: this one, or a second one that clouds are sent to.
 
-ROS is imported by what needs it: commands import this module where there is no ROS.
+Functions import ROS themselves: commands import this module where there is no ROS.
 """
 
 from __future__ import annotations
@@ -16,20 +16,34 @@ from pathlib import Path
 from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_stamp
 from gp_ground_seg.data.point_cloud2 import CloudMessage
-from gp_ground_seg.ros.start_stop import (
-    CHANGED,
+from gp_ground_seg.ros.loader import CHANGED, child_command
+from gp_ground_seg.ros.session import (
     Session,
-    child_command,
     large_cloud_transport,
+    needing_ros,
     ros_session,
+    stop_on_signals,
 )
 
 INPUT, GROUND, OBSTACLES = 'points', 'ground', 'obstacles'  # topics of the node
 OUTPUTS = (GROUND, OBSTACLES)
+DEPTH = 10  # clouds that may wait to be sent, or taken
 PATIENCE = 60.0  # longest time that a cloud may take [s]
 START_TIMEOUT = 300.0  # time the node has to start, on a slow machine that does much else [s]
 
-_RUN = 'from gp_ground_seg.ros.start_stop import run_node; sys.exit(run_node(sys.argv[1:]))'
+_RUN = f'from {__name__} import run_node; sys.exit(run_node(sys.argv[1:]))'
+
+
+def run_node(words: Sequence[str], *, is_managed: bool = False) -> int:
+    """Run a node in this process until a signal; return its exit code.
+
+    `words` are the arguments of the process. Raises a MissingDependencyError without ROS.
+    """
+    # Importing ROS takes most of a second; a signal within it is obeyed as well.
+    with stop_on_signals() as stop:
+        with needing_ros('the node'):
+            from gp_ground_seg.ros.node import main
+        return 0 if stop.made else main(words, is_managed=is_managed)
 
 
 class NodeProcess:
@@ -93,15 +107,12 @@ class Link:
     def __init__(self, session: Session, node: NodeProcess) -> None:
         from sensor_msgs.msg import PointCloud2
 
-        from gp_ground_seg.ros.input import cloud_profile
-
         self._session, self._node = session, node
         self._back: dict[tuple[int, int], dict[str, CloudMessage]] = {}
-        profile = cloud_profile(10)
-        self._publisher = session.node.create_publisher(PointCloud2, INPUT, profile)
+        self._publisher = session.publisher_of_clouds(INPUT, DEPTH)
         for topic in OUTPUTS:
             take = partial(self._take, topic)
-            session.node.create_subscription(PointCloud2, topic, take, profile, raw=True)
+            session.node.create_subscription(PointCloud2, topic, take, DEPTH, raw=True)
 
     def connect(self, cloud: CloudMessage) -> None:
         """Send a cloud until the node answers.
@@ -125,13 +136,13 @@ class Link:
 
     def _ask(self, cloud: CloudMessage, patience: float) -> dict[str, CloudMessage] | None:
         self._publisher.publish(encode_cloud(cloud))
-        stamp, end = stamp_of(cloud), time.monotonic() + patience
-        while time.monotonic() < end:
-            self._session.spin(0.02)
+        stamp = stamp_of(cloud)
+
+        def is_back() -> bool:
             self._node.check()
-            if len(self._back.get(stamp, ())) == len(OUTPUTS):
-                return self._back.pop(stamp)
-        return None
+            return len(self._back.get(stamp, ())) == len(OUTPUTS)
+
+        return self._back.pop(stamp) if self._session.wait_for(is_back, patience) else None
 
     def _take(self, topic: str, raw: bytes) -> None:
         cloud = decode_cloud(raw)

@@ -12,10 +12,8 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import LaserScan, PointCloud2, PointField
-from std_msgs.msg import Header
 
-from gp_ground_seg.core.frame import NOT_FINITE
-from gp_ground_seg.core.pipeline.points import rotate
+from gp_ground_seg.core.frame import NOT_FINITE, BoolArray
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.costmap import (
     DIRECTIONS,
@@ -30,13 +28,13 @@ from gp_ground_seg.data.point_cloud2 import (
     message_data,
     read_xyz,
     select_points,
-    write_xyz,
 )
 from gp_ground_seg.ros.ground_model import ground_model_cloud
-from gp_ground_seg.ros.input import cloud_profile, seconds_of
+from gp_ground_seg.ros.input import seconds_of
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
+OUTPUT_DEPTH = 20  # messages kept: Fast DDS may send a lost fragment again after 0.7 s only
 LONGEST_PERIOD = 1.0
 """Time between two clouds from which it says nothing of the sensor [s]: clouds are missing."""
 
@@ -87,75 +85,51 @@ def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud
     return message
 
 
-def _move_points(message: PointCloud2, segmented: SegmentedCloud) -> None:
-    """Move points of the cloud to the output frame."""
-    assert segmented.placement is not None
-    rotation, translation = segmented.placement
-    message.header = _header(segmented)
-    xyz = rotate(read_xyz(message).astype(np.float64), rotation)
-    write_xyz(message, xyz + translation)
-
-
-def _header(segmented: SegmentedCloud) -> Header:
-    return Header(stamp=segmented.cloud.header.stamp, frame_id=segmented.frame_id)
-
-
 def scan(segmented: SegmentedCloud) -> LaserScan:
-    """Return the nearest obstacle in each direction about the origin of the output frame.
+    """Return the nearest obstacle in each direction about the origin of the cloud.
 
     Edges of drops are obstacles if ``output.max_step_down`` is not 0. Infinite where the direction
     has returns and no obstacle, NaN where it has no return.
     """
-    (x, y), step = segmented.offset, 2.0 * math.pi / DIRECTIONS
-    message = LaserScan(header=_header(segmented), angle_increment=step)
+    step = 2.0 * math.pi / DIRECTIONS
+    message = LaserScan(header=segmented.cloud.header, angle_increment=step)
     message.angle_min, message.angle_max = 0.5 * step - math.pi, math.pi - 0.5 * step
-    message.range_max = segmented.config.grid.r_max + math.hypot(x, y)
+    message.range_max = segmented.config.grid.r_max
     returns = segmented.places(segmented.segmentation.grid.cell != NOT_FINITE)
-    moved = [(px + x, py + y) for px, py in (segmented.blocked, returns)]
-    message.ranges = message_data(scan_ranges(*moved), 'f')
+    message.ranges = message_data(scan_ranges(segmented.blocked, returns), 'f')
     return message
 
 
 def occupancy_grid(segmented: SegmentedCloud) -> OccupancyGrid:
-    """Return the cells about the sensor, in the output frame: free, occupied or unknown."""
+    """Return the cells about the origin of the cloud: free, occupied or unknown."""
     output, ground_std = segmented.config.output, segmented.config.label.ground_tolerance
     ground, obstacles = segmented.places(segmented.is_ground), segmented.blocked
     reach = reach_of_model(segmented.segmentation.surface, segmented.heading, ground_std)
     cells = occupancy(ground, obstacles, reach, output.cell_size, output.grid_size)
-    message = OccupancyGrid(header=_header(segmented))
-    info, (x, y) = message.info, segmented.offset
+    message = OccupancyGrid(header=segmented.cloud.header)
+    info = message.info
     info.map_load_time, info.resolution = message.header.stamp, output.cell_size
     info.height, info.width = cells.shape
-    half = 0.5 * info.width * output.cell_size
-    info.origin.position.x, info.origin.position.y = x - half, y - half
+    info.origin.position.x = info.origin.position.y = -0.5 * info.width * output.cell_size
     info.origin.orientation.w = 1.0
     message.data = message_data(cells, 'b')
     return message
+
+
+def _selected(segmented: SegmentedCloud, chosen: BoolArray) -> PointCloud2:
+    """Return the `chosen` points, (N,) bool, which are finite, with every byte of each."""
+    return select_points(segmented.cloud, chosen, message_bytes, are_finite=True)
 
 
 LABELLED = Output(
     '~/labeled', PointCloud2, lambda s: labelled_cloud(s.cloud, s.segmentation), True
 )
 OUTPUTS = (
-    # Ground and obstacles are finite points.
-    Output(
-        'ground',
-        PointCloud2,
-        lambda s: select_points(s.cloud, s.is_ground, message_bytes, are_finite=True),
-        False,
-    ),
-    Output(
-        'obstacles',
-        PointCloud2,
-        lambda s: select_points(s.cloud, s.is_obstacle, message_bytes, are_finite=True),
-        False,
-    ),
+    Output('ground', PointCloud2, lambda s: _selected(s, s.is_ground), False),
+    Output('obstacles', PointCloud2, lambda s: _selected(s, s.is_obstacle), False),
     LABELLED,
     Output(
-        '~/ground_model',
-        PointCloud2,
-        lambda s: ground_model_cloud(s.cloud, s.segmentation),
-        True,
+        '~/ground_model', PointCloud2, lambda s: ground_model_cloud(s.cloud, s.segmentation), True
     ),
     Output('~/scan', LaserScan, scan, True),
     Output('~/occupancy', OccupancyGrid, occupancy_grid, True),
@@ -172,7 +146,7 @@ class OutputPublishers:
         self._renamed: dict[str, str] = {}
         options = {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
         self._publishers = [
-            (o, node.create_publisher(o.message_type, o.topic, cloud_profile(), **options))
+            (o, node.create_publisher(o.message_type, o.topic, OUTPUT_DEPTH, **options))
             for o in OUTPUTS
         ]
 
@@ -189,10 +163,6 @@ class OutputPublishers:
             for output, publisher in self._publishers
             if not output.is_optional or publisher.get_subscription_count() > 0
         ]
-        if segmented.placement is not None:
-            # The optional ones are built in the output frame.
-            for message in (m for output, _, m in messages if not output.is_optional):
-                _move_points(message, segmented)
         for output, publisher, message in messages:
             if output is LABELLED:
                 self._warn_of_renamed(segmented.cloud)
@@ -208,6 +178,6 @@ class OutputPublishers:
             self._renamed = renamed
             for field, name in renamed.items():
                 self._logger.warning(
-                    f'the input has a field {field} already, which is kept; '
-                    f'in ~/labeled ours is {name}'
+                    f'the input has a field {field} already, which is kept; in ~/labeled ours is '
+                    f'{name}'
                 )

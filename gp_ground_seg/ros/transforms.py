@@ -1,4 +1,4 @@
-"""Where the sensor and the outputs are: by TF or an IMU at the stamp of a cloud, or by earlier."""
+"""Tilt and place of the sensor at the stamp of a cloud: by TF, an IMU, or an earlier cloud."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.core.parameters.config import NO_FRAME, Config
 from gp_ground_seg.core.pipeline.points import angles_of
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
-from gp_ground_seg.data.costmap import Placement
 from gp_ground_seg.ros.input import STEADY_CLOCK, OnCloud, seconds_of
 
 KEPT_JUMP = 1.0  # jump back up to which transforms are kept: a late stamp, no other run [s]
@@ -47,8 +46,6 @@ def require_tf2(config: Config) -> Any:
     if config.frame.sensor != NO_FRAME:
         asked = f'frame.sensor = {config.frame.sensor}'
         instead = 'frame.sensor = none with sensor.origin_x, origin_y and origin_z'
-    elif config.frame.level != 'tf':
-        asked, instead = f'output.frame = {config.output.frame}', 'output.frame = none'
     if (found := find_tf2()) is None:
         raise MissingDependencyError(
             f'{asked}: needs tf2_ros, which cannot be imported: {INSTALL_TF2}, or use {instead}'
@@ -74,19 +71,18 @@ def rotation_of(rotation: Quaternion) -> FloatArray:
     return matrix
 
 
-def _placement(transform: Any, way: str) -> Placement:
-    """Return a geometry_msgs/Transform; raise a PointCloudError if it is none."""
-    move = transform.translation
-    translation = np.array([move.x, move.y, move.z])
+def _translation_of(transform: Any, way: str) -> tuple[float, float, float]:
+    """Return that of a geometry_msgs/Transform; raise a PointCloudError if it is not finite."""
+    place = transform.translation
+    translation = place.x, place.y, place.z
     if not np.isfinite(translation).all():
         raise PointCloudError(f'transform {way}: its translation is {translation}')
-    return Placement(rotation_of(transform.rotation), translation)
+    return translation
 
 
 def is_tf_used(config: Config) -> bool:
-    """Return whether tilt or place of the sensor, or the frame of the outputs, needs TF."""
-    frame = config.frame
-    return frame.level == 'tf' or {frame.sensor, config.output.frame} != {NO_FRAME}
+    """Return whether tilt or place of the sensor needs TF."""
+    return config.frame.level == 'tf' or config.frame.sensor != NO_FRAME
 
 
 def is_listening(config: Config) -> bool:
@@ -99,9 +95,8 @@ class CloudFrames(NamedTuple):
 
     tilt: tuple[float, float] | None = None  # roll and pitch of the sensor [rad]
     origin: tuple[float, float, float] | None = None  # place of the sensor in it [m]
-    base: Placement | None = None  # where ``frame.base`` is
-    # where ``output.frame`` is; None also if it is that of the cloud
-    output: Placement | None = None
+    # rotation (3, 3) and translation (3,) [m] into ``frame.base``
+    base: tuple[FloatArray, FloatArray] | None = None
 
 
 class ImuListener:
@@ -188,7 +183,7 @@ class FrameListener:
         self._timer.cancel()
 
     def _is_known(self, header: Header) -> bool:
-        wanted = {self.config.frame.sensor, self.config.output.frame}
+        wanted = {self.config.frame.sensor}
         if self.config.frame.level == 'tf':
             wanted.add(self.config.frame.base)
         if self._imu is not None:
@@ -217,17 +212,16 @@ class FrameListener:
         frame_id, frame = header.frame_id, self.config.frame
         if frame.level == 'tf':
             way = f'from its frame {frame_id!r} to frame.base = {frame.base!r}'
-            base = _placement(self._newest(frame.base, frame_id, header, way), way)
-            tilt = angles_of(base.rotation[2])
+            found = self._newest(frame.base, frame_id, header, way)
+            base = rotation_of(found.rotation), np.array(_translation_of(found, way))
+            tilt = angles_of(base[0][2])
         elif self._imu is not None:
             tilt = angles_of(self._turn_by_imu(self._imu, header)[2])
         if frame.sensor != NO_FRAME:
             way = f'from frame.sensor = {frame.sensor!r} to its frame {frame_id!r}'
-            place = self._newest(frame_id, frame.sensor, header, way).translation
-            origin = place.x, place.y, place.z
-            if not np.isfinite(origin).all():
-                raise PointCloudError(f'transform {way}: its translation is {origin}')
-        return CloudFrames(tilt, origin, base, self._output(header))
+            found = self._newest(frame_id, frame.sensor, header, way)
+            origin = _translation_of(found, way)
+        return CloudFrames(tilt, origin, base)
 
     def _turn_by_imu(self, listener: ImuListener, header: Header) -> FloatArray:
         """Return the rotation (3, 3) of a cloud into a level frame, by way of that of the IMU."""
@@ -239,19 +233,6 @@ class FrameListener:
         if self._tf2_ros is None:
             raise PointCloudError(f'transform {way}: needs tf2_ros ({INSTALL_TF2})')
         return turn @ rotation_of(self._newest(frame, header.frame_id, header, way).rotation)
-
-    def _output(self, header: Header) -> Placement | None:
-        frame = self.config.output.frame
-        if frame in (NO_FRAME, header.frame_id):
-            return None
-        way = f'from its frame {header.frame_id!r} to output.frame = {frame!r}'
-        try:
-            found = self._exact(frame, header.frame_id, header)
-        except self._tf2_ros.TransformException as error:
-            raise PointCloudError(
-                f'no transform {way} at its stamp within {MAX_WAIT:g} s: {error}'
-            ) from error
-        return _placement(found, way)
 
     def _exact(self, target: str, source: str, header: Header) -> Any:
         stamp = Time.from_msg(header.stamp)

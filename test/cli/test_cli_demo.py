@@ -20,7 +20,7 @@ from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.data.bags import BagReader, decode_cloud
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
-from gp_ground_seg.ros import start_stop
+from gp_ground_seg.ros import loader, session
 from gp_ground_seg.ros.node_process import NodeProcess, private_session
 
 
@@ -130,73 +130,66 @@ def test_a_stopped_demo_leaves_no_node(rclpy, tmp_path, number):
     wait_for(lambda: not any(is_running(pid) for pid in nodes), 'end of the node')
 
 
-def test_a_node_that_ends_is_said_and_one_that_runs_ends_with_its_block(rclpy, tmp_path):
-    log = tmp_path / 'node.log'
-    for words, how, message, logged in (
-        (
-            ['-p', 'label.ground_tolerance:=-1.0'],
-            None,
-            'the node ended with code 2',
-            'label.ground_tolerance',
-        ),
-        ([], signal.SIGKILL, 'the node was killed by signal 9', ''),
-    ):
-        with NodeProcess(log, words) as node:
-            if how:
-                os.kill(node.pid, how)
-            with pytest.raises(GroundSegError, match=message):
-                wait_for(node.check, 'end of the node')
-        assert any(logged in line for line in node.log_lines() or [''])
-    node = NodeProcess(log)
+@pytest.mark.parametrize(
+    ('words', 'number', 'said', 'logged'),
+    [
+        (['-p', 'grid.r_max:=-1.0'], 0, 'ended with code 2', 'grid.r_max'),
+        ([], signal.SIGKILL, 'was killed by signal 9', ''),
+    ],
+)
+def test_a_node_that_ends_is_said(rclpy, tmp_path, words, number, said, logged):
+    with NodeProcess(tmp_path / 'node.log', words) as node:
+        if number:
+            os.kill(node.pid, number)
+        with pytest.raises(GroundSegError, match=f'the node {said}'):
+            wait_for(node.check, 'end of the node')
+    assert any(logged in line for line in node.log_lines() or [''])
+
+
+def test_a_node_ends_with_its_block(rclpy, tmp_path):
+    node = NodeProcess(tmp_path / 'node.log')
     with contextlib.suppress(ZeroDivisionError), node:
         assert is_running(node.pid)
         raise ZeroDivisionError
     assert not is_running(node.pid)
-    for text in ('', start_stop.FOLLOWS, start_stop.STAYS, start_stop.CHANGED):
-        log.write_text(text)
-        assert node.is_compiled() == (text == start_stop.CHANGED)
-
-
-@pytest.fixture
-def no_profile(monkeypatch):
-    """A machine with plenty of shared memory, where the user has chosen no transport."""
-    for name in start_stop._TRANSPORT_VARIABLES:
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(start_stop, '_free_shared_memory', lambda: 1 << 30)
+    for text in ('', loader.FOLLOWS, loader.STAYS, loader.CHANGED):
+        (tmp_path / 'node.log').write_text(text)
+        assert node.is_compiled() == (text == loader.CHANGED)
 
 
 def profile_in_use():
     before = dict(os.environ)
-    with start_stop.large_cloud_transport():
+    with session.large_cloud_transport():
         (found,) = {*os.environ.items()} - {*before.items()} or {(None, None)}
     assert dict(os.environ) == before
     return found[1]
 
 
-def test_profile_of_a_checkout_and_of_an_installation(no_profile, monkeypatch, tmp_path):
+def test_the_profile_for_large_clouds(monkeypatch, tmp_path):
+    """That of a checkout, or of an installation; none where the user chose, or without memory."""
+    for name in session._TRANSPORT_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(session, '_free_shared_memory', lambda: 1 << 30)
     shipped = Path(__file__).parents[2] / 'config' / 'fastdds_large_clouds.xml'
     assert Path(profile_in_use()) == shipped
-    module = tmp_path / 'lib/python3.12/site-packages/gp_ground_seg/ros/start_stop.py'
-    monkeypatch.setattr(start_stop, '__file__', str(module))
+    for name in session._TRANSPORT_VARIABLES:
+        with monkeypatch.context() as patched:
+            patched.setenv(name, 'mine')
+            assert profile_in_use() is None
+    module = tmp_path / 'lib/python3.12/site-packages/gp_ground_seg/ros/session.py'
+    monkeypatch.setattr(session, '__file__', str(module))
     assert profile_in_use() is None
     installed = tmp_path / 'share/gp_ground_seg/config/fastdds_large_clouds.xml'
     installed.parent.mkdir(parents=True)
     installed.touch()
     assert Path(profile_in_use()) == installed
-
-
-@pytest.mark.parametrize('name', start_stop._TRANSPORT_VARIABLES)
-def test_no_profile_where_the_user_chose_or_shared_memory_is_short(no_profile, monkeypatch, name):
-    with monkeypatch.context() as patched:
-        patched.setenv(name, 'mine')
-        assert profile_in_use() is None
-    monkeypatch.setattr(start_stop, '_free_shared_memory', lambda: 64 << 20)
+    monkeypatch.setattr(session, '_free_shared_memory', lambda: 64 << 20)
     assert profile_in_use() is None
 
 
 def test_each_session_has_a_namespace_of_its_own(rclpy):
     names = []
     for _ in range(2):
-        with private_session('link') as (session, _):
-            names.append(session.node.get_namespace())
+        with private_session('link') as (link, _):
+            names.append(link.node.get_namespace())
     assert names[0] != names[1] and '/' not in names

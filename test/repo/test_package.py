@@ -16,7 +16,7 @@ from test_layout import PACKAGE, parse
 
 import gp_ground_seg
 from gp_ground_seg.core.errors import install_hint
-from gp_ground_seg.ros.start_stop import ROS_WHEELS
+from gp_ground_seg.ros.session import ROS_WHEELS
 
 
 @pytest.fixture

@@ -1,10 +1,8 @@
 """A node whose compiled code is not there yet: on numpy at first, compiled code in the end."""
 
-import io
 import signal
 import sys
 import threading
-import time
 
 import pytest
 import ros_helpers as ros
@@ -14,8 +12,8 @@ from ros_helpers import street, to_message
 from gp_ground_seg import Config
 from gp_ground_seg.core import jit, segmenter
 from gp_ground_seg.core.jit import HAVE_NUMBA, code_folder
-from gp_ground_seg.ros import start_stop
-from gp_ground_seg.ros.start_stop import CHANGED, FOLLOWS, STAYS, BackendLoader, child_command
+from gp_ground_seg.ros import loader
+from gp_ground_seg.ros.loader import CHANGED, FOLLOWS, STAYS, BackendLoader, child_command
 
 pytestmark = pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
 
@@ -99,7 +97,7 @@ def test_numpy_asked_for_meanwhile_stays(b, held_back):
 
 def test_a_failure_is_a_warning_and_the_node_goes_on(monkeypatch, tmp_path):
     monkeypatch.setattr(jit, 'is_code_kept', lambda: False)
-    monkeypatch.setattr(start_stop, '_COMPILE', "raise OSError('no space left')")
+    monkeypatch.setattr(loader, '_COMPILE', "raise OSError('no space left')")
     with ros.stderr_in(tmp_path) as stderr, ros.bench(settled=False) as b:
         assert 'OSError: no space left' in ros.said_by(stderr, STAYS)
         b.segment(to_message(street(1000)))
@@ -108,14 +106,14 @@ def test_a_failure_is_a_warning_and_the_node_goes_on(monkeypatch, tmp_path):
 
 def test_loader_that_is_closed_calls_nobody_and_frees_its_backend(held_back):
     calls = []
-    loader = BackendLoader(lambda: calls.append(1))
-    loader.start(Config())
-    assert loader.is_busy
-    loader.stop()
+    made = BackendLoader(lambda: calls.append(1))
+    made.start(Config())
+    assert made.is_busy
+    made.stop()
     held_back.set()
-    loader.close()
-    assert calls == [] and not loader.is_busy
-    assert loader.take_backend() is None
+    made.close()
+    assert calls == [] and not made.is_busy
+    assert made.take_backend() is None
 
 
 def test_a_child_imports_nothing_from_relative_folders(monkeypatch):
@@ -123,24 +121,11 @@ def test_a_child_imports_nothing_from_relative_folders(monkeypatch):
     assert "'here'" not in ' '.join(child_command('pass'))
 
 
-def test_warm_up_shows_how_many_functions_are_ready(monkeypatch, capsys):
-    terminal = io.StringIO()
-    terminal.isatty = lambda: True
-    real, states = segmenter.warm_up, iter([(0, 21), (5, 21), (14, 21)])
-
-    def warm_up_slowly():
-        time.sleep(1.0)
-        return real()
-
-    monkeypatch.setattr(sys, 'stderr', terminal)
-    monkeypatch.setattr(segmenter, 'warm_up', warm_up_slowly)
-    monkeypatch.setattr(jit, 'count_ready', lambda: next(states, (14, 21)))
-    assert run('warm-up') == 0
-    assert [text in terminal.getvalue() for text in (' 0/21 ', ' 5/21 ', ' 14/21 ')] == [True] * 3
-    assert capsys.readouterr().out.startswith('compiled code is kept in ')
-
-
 def test_warm_up_command_says_where_the_code_is(capsys):
     assert run('warm-up') == 0
-    said = capsys.readouterr().out
-    assert said.startswith(f'compiled code is kept in {code_folder()}; it was there after ')
+    said = capsys.readouterr()
+    assert said.out.startswith(f'compiled code is kept in {code_folder()}; it was there after ')
+    assert (
+        said.err
+        == 'gp-ground-seg: note: compiling what is not on disk yet: 20 to 60 s for all of it\n'
+    )

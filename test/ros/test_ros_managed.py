@@ -16,7 +16,7 @@ from ros_helpers import street, to_message, wait_for
 from gp_ground_seg.core.backend import choose_backend
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.ros.start_stop import FOLLOWS
+from gp_ground_seg.ros.loader import FOLLOWS
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 

@@ -1,6 +1,5 @@
 """The topics: every byte of a cloud, and the optional ones, which cost nothing unasked."""
 
-import dataclasses
 from array import array
 
 import numpy as np
@@ -14,7 +13,7 @@ from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.core.pipeline.points import single_precision
 from gp_ground_seg.data import costmap
-from gp_ground_seg.data.costmap import Placement, SegmentedCloud
+from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_columns, read_xyz
 from gp_ground_seg.ros import outputs
 from gp_ground_seg.ros.ground_model import read_ground_model
@@ -126,8 +125,6 @@ def test_scan_is_what_a_costmap_takes(b, reduced):
     )
     np.testing.assert_array_equal(ranges, costmap.scan_ranges(*places))
     assert found.range_min == 0.0 and found.range_max == 80.0
-    placement = Placement(np.eye(3), np.array([3.0, 4.0, 5.0]))
-    assert outputs.scan(dataclasses.replace(expected, placement=placement)).range_max == 85.0
     assert len(ranges) * found.angle_increment == pytest.approx(2.0 * np.pi)
     # As laser_geometry places them: each on an obstacle of its direction.
     hit = np.isfinite(ranges)
@@ -258,7 +255,6 @@ def test_quality_of_service_of_every_output_can_be_overridden():
 
 # Clouds of four layouts through the real node, over DDS; test_point_cloud2.py has any.
 
-CODES = ('i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'f4', 'f8')
 CASES = {
     'one row without row_step': ('<f4', (1, 200), 0, 0.1),
     'double precision, big-endian, padded rows': ('>f8', (5, 40), 13, 0.0),
@@ -271,14 +267,11 @@ CASES = {
 def cloud_of(code, shape, padding, share):
     """Message with gaps and further fields, coordinates (N, 3), and the bytes of each point."""
     rng, (height, width) = np.random.default_rng(0), shape
-    types = {'ring': 'u2', 'z': code[1:], 'label': 'u1', 'x': code[1:], 'réflexion': 'f8'}
-    types |= {'y': code[1:], 'height': 'i4'}
-    sizes = [np.dtype(name).itemsize for name in types.values()]
-    starts = 3 * np.arange(1, len(sizes) + 1) + np.cumsum([0, *sizes[:-1]])
-    dtype = np.dtype({
-        'names': [*types], 'formats': [code[0] + name for name in types.values()],
-        'offsets': starts, 'itemsize': starts[-1] + sizes[-1] + 5,
-    })  # fmt: skip
+    names = ['ring', 'z', 'label', 'x', 'réflexion', 'y', 'height']
+    others = {'ring': 'u2', 'label': 'u1', 'réflexion': 'f8', 'height': 'i4'}
+    formats = [code[0] + others.get(name, code[1:]) for name in names]
+    layout = {'names': names, 'formats': formats, 'offsets': [*range(3, 80, 11)]}
+    dtype = np.dtype({**layout, 'itemsize': 82})
     raw = rng.integers(0, 256, (height * width, dtype.itemsize), dtype=np.uint8)
     points = raw.view(dtype)[:, 0]
     source = ros.street(len(points))
@@ -289,17 +282,10 @@ def cloud_of(code, shape, padding, share):
     points['x'][:1] = 500.0  # beyond the grid: no height there
     rows = raw.reshape(height, width * dtype.itemsize)
     rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=7)
-    message = PointCloud2(height=height, width=width, point_step=dtype.itemsize)
-    message.row_step, message.is_bigendian = rows.shape[1] * (height != 1), code[0] == '>'
-    message.fields = [
-        PointField(name=name, offset=dtype.fields[name][1], datatype=1 + CODES.index(of), count=1)
-        for name, of in types.items()
-    ]
-    message.header.frame_id = 'velo_link'
-    message.header.stamp.sec, message.header.stamp.nanosec = -height, 999_999_999
-    message.data = array('B', rows.tobytes())
-    xyz = np.stack([points[axis].astype(code[1:]) for axis in 'xyz'], axis=-1)
-    return message, xyz, [row.tobytes() for row in raw]
+    message = to_message(points, (-height, 999_999_999), 'velo_link')
+    message.height, message.width, message.is_bigendian = height, width, code[0] == '>'
+    message.row_step, message.data = rows.shape[1] * (height != 1), array('B', rows.tobytes())
+    return message, xyz_of(points).astype(code[1:]), [row.tobytes() for row in raw]
 
 
 @pytest.mark.parametrize('case', CASES)

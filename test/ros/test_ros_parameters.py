@@ -1,5 +1,7 @@
 """Parameters of the node through its ROS services, and at its start."""
 
+import math
+
 import numpy as np
 import pytest
 import ros_helpers as ros
@@ -16,7 +18,7 @@ from ros_helpers import bench, street, to_message
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.config import PRESETS, find_spec, parameter_specs
-from gp_ground_seg.ros.start_stop import CHANGED
+from gp_ground_seg.ros.loader import CHANGED
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -127,19 +129,7 @@ def test_a_number_or_auto_is_taken_and_nothing_else(b, name):
         (found,) = described(b, [name])
         assert found.type == TYPES[type(value)]
         assert found.floating_point_range[0].to_value == find_spec(name).maximum
-    wrong = [
-        'Auto',
-        'automatic',
-        '',
-        '0.5',
-        True,
-        99,
-        99.0,
-        float('nan'),
-        float('inf'),
-        [0.5],
-        None,
-    ]
+    wrong = ['Auto', 'automatic', '', '0.5', True, 99, 99.0, math.nan, math.inf, [0.5], None]
     for value in wrong:
         reason = b.refusal(name, value)
         assert f'{name} = ' in reason and 'must be auto or a number in [' in reason
@@ -159,6 +149,12 @@ def test_several_at_once_are_all_taken_or_none(b):
     assert set_all(r_min=40.0, r_max=49.0).successful
     assert set_all(r_max=30.0, r_min=1.0).successful
     assert values_of(b) == {**Config().flat(), 'grid.r_min': 1.0, 'grid.r_max': 30.0}
+    # Of a file, the good ones: one by one, r_min comes after the r_max that it has to be below.
+    asked = {'label.ground_tolerance': 9.0, 'grid.r_max': 50.0, 'grid.r_min': 40.0}
+    results = b.load(asked)
+    assert [result.successful for result in results] == [False, True, True]
+    assert 'label.ground_tolerance = 9.0: must be' in results[0].reason
+    assert b.node.config == Config().replace(**{'grid.r_min': 40.0, 'grid.r_max': 50.0})
 
 
 @pytest.mark.parametrize('setter', ros.SETTERS)
@@ -215,12 +211,19 @@ def dump(b):
 @given(config=configs(), order=st.permutations(NAMES))
 def test_any_configuration_can_be_loaded_over_any_other_in_any_order(shared, config, order):
     # TF may not be installed.
-    plain = {'frame.level': 'sensor', 'frame.sensor': 'none', 'output.frame': 'none'}
-    plain['runtime.backend'] = 'auto'
+    plain = {'frame.level': 'sensor', 'frame.sensor': 'none', 'runtime.backend': 'auto'}
     config = config.replace(**plain)
     values = {name: config[name] for name in order}
     assert all(result.successful for result in shared.load(values))
     assert shared.node.config == config
+
+
+def started_with(path):
+    """Parameters of a node that is started with a file."""
+    namespace, name = ros.NAMESPACE, ros.NODE_NAME
+    words = '-r', f'__ns:={namespace}', '-r', f'__node:={name}', '--params-file', str(path)
+    with ros.started_node(*words) as node:
+        return node.config
 
 
 @pytest.mark.parametrize('height', [1.2, 'auto'])
@@ -231,21 +234,12 @@ def test_what_is_dumped_is_what_runs_and_can_be_given_at_start(b, tmp_path, heig
     path.write_text(yaml.safe_dump(dump(b)))
     # Our own tools read it, use_sim_time, qos_overrides and all.
     assert Config.problems_of_file(path) == []
-    assert Config.from_yaml(path) == config
-    namespace, _, name = b.node_name.rpartition('/')
-    words = '-r', f'__ns:={namespace}', '-r', f'__node:={name}', '--params-file', str(path)
-    with ros.started_node(*words) as node:
-        assert node.config == config
+    assert Config.from_yaml(path) == started_with(path) == config
 
 
-def test_one_bad_value_of_a_file_is_refused_and_the_others_taken(b):
-    assert b.set('grid.r_max', 30.0).successful
-    # One by one, r_min comes after the r_max that it has to be below.
-    asked = {'label.ground_tolerance': 9.0, 'grid.r_max': 50.0, 'grid.r_min': 40.0}
-    results = b.load(asked)
-    assert [result.successful for result in results] == [False, True, True]
-    assert 'label.ground_tolerance = 9.0: must be' in results[0].reason
-    assert b.node.config == Config().replace(**{'grid.r_min': 40.0, 'grid.r_max': 50.0})
+@pytest.mark.parametrize('name', PRESETS)
+def test_node_starts_with_every_shipped_file(name):
+    assert started_with(REPOSITORY / 'config' / f'{name}.yaml') == PRESETS[name].config
 
 
 def test_changes_during_playback_lose_no_frame(b):
@@ -265,13 +259,6 @@ def test_changes_during_playback_lose_no_frame(b):
     b.ground.wait(before + 100)
     b.obstacles.wait(before + 100)
     assert b.node.config.label.ground_tolerance == tolerances[-1]
-
-
-@pytest.mark.parametrize('name', PRESETS)
-def test_node_starts_with_every_shipped_file(name):
-    path = REPOSITORY / 'config' / f'{name}.yaml'
-    with ros.started_node('--params-file', str(path), '-r', '__ns:=/any') as node:
-        assert node.config == PRESETS[name].config
 
 
 def test_unknown_names_are_reported_and_not_declared(tmp_path):
@@ -307,11 +294,7 @@ def test_a_start_with_the_defaults_is_one_line_about_them(tmp_path):
 
 @pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
 def test_a_given_height_is_not_doubted_before_the_first_cloud(tmp_path):
-    with (
-        ros.stderr_in(tmp_path) as stderr,
-        ros.started_node(*ros.given({'sensor.height': 4.5})) as node,
-    ):
-        ros.wait_for(lambda: node._is_compiled, 'compiled backend')
-        log = ros.said_by(stderr, CHANGED)
-    assert 'sensor.height: 4.5 m' in log
+    height = ros.given({'sensor.height': 4.5})
+    with ros.stderr_in(tmp_path) as stderr, ros.started_node(*height):
+        log = ros.said_by(stderr, CHANGED, 'sensor.height: 4.5 m')
     assert 'is sensor.height right' not in log

@@ -77,38 +77,31 @@ def test_values_of_every_type_are_answered(setter):
             assert result.successful == (number == ParameterType.PARAMETER_DOUBLE)
             wanted = 'must be a number in' if number < 10 else f': {number} is not a valid'
             assert result.successful or wanted in result.reason
-        link.segment(to_message(street(500)))
+        link.segment(SMALL)
 
 
-def test_what_rclpy_raises_does_not_end_the_node(node):
-    """A negative time on /clock, for example."""
+def test_a_clock_that_is_missing_or_wrong_does_not_end_the_node(node):
+    """Without a time it says so; at a negative one rclpy raises."""
+    clock = Clock()
     with ros.linked() as link:
         assert link.set('use_sim_time', True).successful
-        publisher, clock = link.probe.create_publisher(Clock, '/clock', 1), Clock()
-        clock.clock.sec = -5
-        wait_for(lambda: publisher.publish(clock) or 'negative' in node.log, 'message')
-        link.segment(to_message(street(500)))
-        assert link.set('use_sim_time', False).successful
-
-
-def test_simulated_time_without_a_clock_is_said(node):
-    with ros.linked() as link:
-        assert link.set('use_sim_time', True).successful
-        link.segment(to_message(street(500)))
+        link.segment(SMALL)
         status = link.wait_for_status('input', lambda _, s: NO_TIME in s.message)
         assert status.level == DiagnosticStatus.WARN
         link.diagnostics.wait(8)
         (line,) = [line for line in node.log.splitlines() if NO_TIME in line]
         assert '[WARN]' in line
-        publisher, clock = link.probe.create_publisher(Clock, '/clock', 1), Clock()
-        clock.clock.sec = 5
-        wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription of /clock')
+        publisher = link.probe.create_publisher(Clock, '/clock', 1)
 
         def has_time(_, status):
             publisher.publish(clock)  # the first may be lost: both sides must know each other
             return NO_TIME not in status.message
 
+        clock.clock.sec = 5
         link.wait_for_status('input', has_time)
+        clock.clock.sec = -5
+        wait_for(lambda: publisher.publish(clock) or 'negative' in node.log, 'message')
+        link.segment(SMALL)
         assert link.set('use_sim_time', False).successful
 
 
@@ -281,7 +274,7 @@ sys.path.insert(0, {str(Path(__file__).parents[1])!r})
 import rclpy
 from ros_helpers import BEST_EFFORT, PointCloud2, street, to_message
 rclpy.init()
-node = rclpy.create_node('driver', namespace=sys.argv[1])
+node = rclpy.create_node('driver', namespace={NAMESPACE!r})
 publisher = node.create_publisher(PointCloud2, 'points', BEST_EFFORT)
 message = to_message(street(30_000))
 while True:
@@ -292,13 +285,12 @@ while True:
 
 @pytest.mark.slow
 def test_best_effort_driver_with_the_large_segment_profile(node, tmp_path):
-    profile = REPOSITORY / 'config' / 'fastdds_large_clouds.xml'
-    environment = {'FASTRTPS_DEFAULT_PROFILES_FILE': str(profile)}
-    command = [sys.executable, '-c', DRIVER, NAMESPACE]
-    with (
-        ros.linked(sends=None) as link,
-        ros.Process(folder=tmp_path, command=command, **environment) as driver,
-    ):
+    profile = str(REPOSITORY / 'config' / 'fastdds_large_clouds.xml')
+    options = {
+        'command': [sys.executable, '-c', DRIVER],
+        'FASTRTPS_DEFAULT_PROFILES_FILE': profile,
+    }
+    with ros.linked(sends=None) as link, ros.Process(folder=tmp_path, **options) as driver:
         link.ground.wait(5)
         assert driver.popen.poll() is None
         # Fast DDS only warns about a profile that it cannot read, and goes on without.

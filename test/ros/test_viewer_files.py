@@ -16,50 +16,39 @@ from gp_ground_seg.lab.plotting import COLOURS, HEIGHTS
 NODE = '/ground_segmentation_node'
 KINDS = {'scan': 'LaserScan', 'occupancy': 'Map'}
 """Displays of RViz that show no points."""
-OPTIONAL = {f'{NODE}/{name}' for name in ('labeled', 'ground_model', *KINDS)}
-TOPICS = {'/ground', '/obstacles', *OPTIONAL}
+TOPICS = {
+    '/ground',
+    '/obstacles',
+    *(f'{NODE}/{name}' for name in ('labeled', 'ground_model', *KINDS)),
+}
+RVIZ = (REPOSITORY / 'config' / 'ground_segmentation.rviz').read_text(encoding='utf-8')
+DISPLAYS = [
+    display
+    for display in yaml.safe_load(RVIZ)['Visualization Manager']['Displays']
+    if 'Topic' in display
+]
+FOXGLOVE = json.loads((REPOSITORY / 'config' / 'foxglove_layout.json').read_text(encoding='utf-8'))
+PANEL = FOXGLOVE['configById']['3D!ground']['topics']
 
 
 def test_topics_are_those_of_the_node():
     outputs = pytest.importorskip('gp_ground_seg.ros.outputs', reason='ROS is not installed')
     names = [output.topic for output in outputs.OUTPUTS]
     found = {name.replace('~', NODE) if name[0] == '~' else f'/{name}' for name in names}
-    assert found == TOPICS
+    assert found == TOPICS == set(PANEL) == {one['Topic']['Value'] for one in DISPLAYS}
 
 
-def test_rviz_shows_every_topic():
-    text = (REPOSITORY / 'config' / 'ground_segmentation.rviz').read_text(encoding='utf-8')
-    assert '<<:' not in text  # RViz reads it with yaml-cpp, which has no merge keys
-    manager = yaml.safe_load(text)['Visualization Manager']
-    shown = [display for display in manager['Displays'] if 'Topic' in display]
-    assert {display['Topic']['Value'] for display in shown} == TOPICS
-    for display in shown:
+def test_rviz_and_foxglove_read_their_files():
+    assert '<<:' not in RVIZ  # RViz reads it with yaml-cpp, which has no merge keys
+    for display in DISPLAYS:
         assert display['Topic']['Reliability Policy'] == 'Reliable'
         kind = KINDS.get(display['Topic']['Value'].split('/')[-1], 'PointCloud2')
         assert display['Class'] == f'rviz_default_plugins/{kind}'
     # What costs the node something is off until it is wanted.
-    on = {display['Topic']['Value'] for display in shown if display['Enabled']}
+    on = {display['Topic']['Value'] for display in DISPLAYS if display['Enabled']}
     assert on == {'/ground', '/obstacles'}
-
-
-def test_foxglove_shows_every_topic():
-    text = (REPOSITORY / 'config' / 'foxglove_layout.json').read_text(encoding='utf-8')
-    layout = json.loads(text)
-    assert set(layout['configById']['3D!ground']['topics']) == TOPICS
-    panels = re.findall(r'"(\w+!\w+)"', json.dumps(layout['layout']))
-    assert sorted(panels) == sorted(layout['configById'])
-
-
-def colour_fields():
-    """Topic and field of each display that colours points by a field."""
-    text = (REPOSITORY / 'config' / 'ground_segmentation.rviz').read_text(encoding='utf-8')
-    for display in yaml.safe_load(text)['Visualization Manager']['Displays']:
-        if 'Channel Name' in display:
-            yield display['Topic']['Value'], display['Channel Name']
-    text = (REPOSITORY / 'config' / 'foxglove_layout.json').read_text(encoding='utf-8')
-    for topic, settings in json.loads(text)['configById']['3D!ground']['topics'].items():
-        if 'colorField' in settings:
-            yield topic, settings['colorField']
+    panels = re.findall(r'"(\w+!\w+)"', json.dumps(FOXGLOVE['layout']))
+    assert sorted(panels) == sorted(FOXGLOVE['configById'])
 
 
 def test_fields_are_those_of_the_messages():
@@ -70,7 +59,8 @@ def test_fields_are_those_of_the_messages():
     result = GroundSegmenter(backend=NumpyBackend()).segment(ros.xyz_of(points))
     segmented = SegmentedCloud(cloud, result, Config())
     made = {o.topic: o.build(segmented) for o in outputs.OUTPUTS}
-    shown = set(colour_fields())
+    shown = {(d['Topic']['Value'], d['Channel Name']) for d in DISPLAYS if 'Channel Name' in d}
+    shown |= {(topic, one['colorField']) for topic, one in PANEL.items() if 'colorField' in one}
     assert {(f'{NODE}/ground_model', name) for name in ('std', 'length_scale')} <= shown
     assert (f'{NODE}/labeled', 'label') in shown
     for topic, field in shown:
@@ -78,17 +68,13 @@ def test_fields_are_those_of_the_messages():
 
 
 def test_colours_are_those_of_the_pictures():
-    rviz = (REPOSITORY / 'config' / 'ground_segmentation.rviz').read_text(encoding='utf-8')
-    foxglove = (REPOSITORY / 'config' / 'foxglove_layout.json').read_text(encoding='utf-8')
-    displays = yaml.safe_load(rviz)['Visualization Manager']['Displays']
-    topics = json.loads(foxglove)['configById']['3D!ground']['topics']
     for topic, name in (('/ground', 'ground'), ('/obstacles', 'obstacle')):
-        (shown,) = (one for one in displays if one.get('Topic', {}).get('Value') == topic)
+        (shown,) = (display for display in DISPLAYS if display['Topic']['Value'] == topic)
         assert [*map(int, shown['Color'].split(';'))] == [*bytes.fromhex(COLOURS[name][1:])]
-        assert topics[topic]['flatColor'] == f'{COLOURS[name].lower()}ff'
-    (heights,) = (one for one in displays if one.get('Channel Name') == 'height')
+        assert PANEL[topic]['flatColor'] == f'{COLOURS[name].lower()}ff'
+    (heights,) = (one for one in DISPLAYS if one.get('Channel Name') == 'height')
     assert (heights['Min Intensity'], heights['Max Intensity']) == HEIGHTS
-    labeled = topics[f'{NODE}/labeled']
+    labeled = PANEL[f'{NODE}/labeled']
     assert (labeled['minValue'], labeled['maxValue']) == HEIGHTS
 
 

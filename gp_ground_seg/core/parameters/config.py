@@ -84,8 +84,6 @@ class InputConfig:
 class OutputConfig:
     """The clouds ground and obstacles, scan and occupancy; the node only."""
 
-    frame: str = advanced(NO_FRAME, (),
-        'their frame, by TF at the stamp of the cloud; none = that of the cloud')
     min_height: float = advanced(-ANY_HEIGHT, (-ANY_HEIGHT, ANY_HEIGHT),
         'least height over the ground of an obstacle; -100 = any', 'm')
     max_height: float = advanced(ANY_HEIGHT, (-ANY_HEIGHT, ANY_HEIGHT),

@@ -1,0 +1,146 @@
+"""Compiled code for a node, made while the node segments without it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from gp_ground_seg.core.parameters.config import Config
+
+if TYPE_CHECKING:
+    from gp_ground_seg.core.backend import Backend
+
+FOLLOWS = (
+    'segmenting with numpy until the compiled code is there: a second, or 20 to 60 s to compile it'
+)
+CHANGED = 'segmenting with numba now'
+STAYS = 'segmenting with numpy from now on'
+JOIN_TIMEOUT = 0.5  # longest wait for the thread [s]
+
+# Collecting garbage less often, as the commands do, saves a tenth of the time.
+_COMPILE = 'import gc; gc.set_threshold(50_000); ' + (
+    'from gp_ground_seg.core.segmenter import warm_up; warm_up()'
+)
+_CHILD = """\
+import os, signal, sys, threading
+sys.path[:] = {path!r}
+# Standard input ends when the process that has started this one does.
+end = lambda: (os.read(0, 1), os.kill(os.getpid(), signal.SIGTERM))
+threading.Thread(target=end, daemon=True).start()
+{code}
+"""
+
+
+def child_command(code: str) -> list[str]:
+    """Return the command of a Python process that runs `code`, and ends when this one does.
+
+    Start it with a pipe as standard input. It imports what this process does, and nothing from
+    the current folder, which may be any.
+    """
+    path = [entry for entry in sys.path if os.path.isabs(entry)]
+    return [sys.executable, '-c', _CHILD.format(path=path, code=code)]
+
+
+class BackendLoader:
+    """Makes the compiled backend in a thread, while frames are segmented without it.
+
+    `on_done` is called there when the backend is made or cannot be made; not after `stop`.
+    """
+
+    error = ''
+    seconds = 0.0
+    is_ready = False
+    """Whether `take_backend` has a result that was not taken yet."""
+    _backend: Backend | None = None
+    _is_stopped = False
+    _compiler: subprocess.Popen[bytes] | None = None
+    _thread: threading.Thread | None = None
+
+    def __init__(self, on_done: Callable[[], None]) -> None:
+        self._on_done = on_done
+        self._lock = threading.Lock()
+
+    @property
+    def is_started(self) -> bool:
+        """Whether `start` has been called."""
+        return self._thread is not None
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(self, config: Config) -> None:
+        """Begin to make the backend for `config`."""
+        self._thread = threading.Thread(target=self._run, args=(config,), daemon=True)
+        self._thread.start()
+
+    def take_backend(self) -> Backend | None:
+        """Return the backend, once; None if it cannot be made, and `error` says why."""
+        backend, self._backend, self.is_ready = self._backend, None, False
+        return backend
+
+    def stop(self) -> None:
+        """End the compiling process; `on_done` is not called from now on."""
+        with self._lock:
+            self._is_stopped = True
+            if self._compiler is not None:
+                self._compiler.kill()
+
+    def close(self) -> None:
+        """Stop, and wait for the thread.
+
+        Not for one that compiles in this process, where no folder can keep the code: that takes
+        20 to 60 s.
+        """
+        self.stop()
+        if self._thread is not None:
+            self._thread.join(JOIN_TIMEOUT)
+
+    def _run(self, config: Config) -> None:
+        start = time.monotonic()
+        backend = None
+        try:
+            # It declares the compiled functions: then it is known which of them are on disk.
+            import gp_ground_seg.core.compiled.backend  # noqa: F401
+            from gp_ground_seg.core.jit import code_folder, is_code_kept
+            from gp_ground_seg.core.segmenter import warm_up
+
+            if code_folder() is not None and not is_code_kept():
+                self._compile()
+            if not self._is_stopped:
+                # Not with a given height: the scan that is segmented here has another.
+                backend = warm_up(dataclasses.replace(config, sensor=Config().sensor))
+        except Exception as error:
+            self.error = f'{type(error).__name__}: {error}'
+        self.seconds = time.monotonic() - start
+        with self._lock:
+            if not self._is_stopped:
+                self._backend, self.is_ready = backend, True
+                self._on_done()
+
+    def _compile(self) -> None:
+        """Compile in a child process, whose memory is free after it: twice what the node needs."""
+        with self._lock:
+            if self._is_stopped:
+                return
+            self._compiler = subprocess.Popen(
+                child_command(_COMPILE),
+                cwd='/',
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+            )
+        with self._compiler:
+            assert self._compiler.stderr is not None
+            said = self._compiler.stderr.read().decode(errors='replace').strip()
+            code = self._compiler.wait()
+        if code and not self._is_stopped:
+            reason = said.splitlines()[-1] if said else f'exit code {code}'
+            raise RuntimeError(f'the compiling process failed: {reason}')
