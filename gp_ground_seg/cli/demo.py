@@ -23,7 +23,7 @@ from gp_ground_seg.data.files import staged_files
 from gp_ground_seg.data.point_cloud2 import CloudMessage, read_fields, read_xyz
 from gp_ground_seg.lab.plotting import new_figure, plot_scan_view
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_labels, label_ratios
-from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
+from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_scan
 from gp_ground_seg.ros.node_process import GROUND, OBSTACLES, Link, NodeProcess, private_session
 from gp_ground_seg.ros.session import needing_ros
 
@@ -40,7 +40,7 @@ SEED, SPEED = 3, 8.0
 LABELS = {GROUND: Label.GROUND, OBSTACLES: Label.OBSTACLE}
 """Label of what comes back on each topic."""
 PERIOD = 0.1
-"""Shortest time from one scan to the next [s]."""
+"""Time of one turn of the sensor, and the shortest from sending one scan to the next [s]."""
 LAST_LINES = 20
 """Of the node's log, printed when the demo fails."""
 
@@ -83,8 +83,10 @@ def simulated_drive(
 
     Points (N, 4), SemanticKITTI class of each (N,), time since the start [s].
     """
-    for scan in simulate_drive(SCENES['urban'](SEED), HDL_64E, n_frames, SPEED, SEED):
-        yield scan.points, semantic_kitti_labels(scan.kind), scan.time
+    scene, rng = SCENES['urban'](SEED), np.random.default_rng(SEED)
+    for k in range(n_frames):
+        scan = simulate_scan(scene, HDL_64E, rng, x=SPEED * k * PERIOD)
+        yield scan.points, semantic_kitti_labels(scan.kind), k * PERIOD
 
 
 class Tally:

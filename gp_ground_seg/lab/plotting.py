@@ -118,7 +118,9 @@ def plot_scan_view(
     axes.set_axis_off()
     axes.set_xlim(-0.5, 0.5)
     axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
-    figure.text(0.5, 0.96, title, ha='center', parse_math=False, fontsize=14)
+    figure.text(
+        0.5, 0.96, title, ha='center', parse_math=False, fontsize=14, backgroundcolor='white'
+    )
     place, depth = project(xyz, camera)
     for name, layer in layers.items():
         chosen = np.flatnonzero(layer & (depth > CLOSEST))

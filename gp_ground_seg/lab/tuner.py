@@ -277,8 +277,8 @@ class Tuner:
         """Parameters of the page; raises ConfigError if they contradict each other."""
         return self._start.replace(**{name: read() for name, read in self._controls.items()})
 
-    def add_button(self, title: str, action: Callable[[Config], str]) -> None:
-        """Add a button; `action` is given the parameters, and returns what to say."""
+    def add_button(self, title: str, action: Callable[[Config], str | None]) -> None:
+        """Add a button; `action` takes the parameters, and returns what to say, if anything."""
         button, said = self._server.gui.add_button(title), self._server.gui.add_html('')
         button.on_click(lambda _event: _tell(said, lambda: action(self.config)))
 
@@ -288,14 +288,12 @@ class Tuner:
             self._changed.clear()
             _tell(self._said, self._update)
 
-    def _update(self) -> str:
+    def _update(self) -> None:
         self.show(self._frame.value, self._colours.value, self.config)
-        return ''
 
-    def _compare(self, config: Config) -> str:
+    def _compare(self, config: Config) -> None:
         self._reference = config
         self._changed.set()
-        return ''
 
     def _watch(self, *controls: Any) -> None:
         """Have `run` segment again when one of the controls changes."""
@@ -362,7 +360,7 @@ class Tuner:
             self._table.content = _table(result, before, scores)
 
 
-def _tell(place: Any, action: Callable[[], str]) -> None:
+def _tell(place: Any, action: Callable[[], str | None]) -> None:
     """Show at a place of the page what `action` says, or why it failed: the page lives on."""
     try:
         words = action()

@@ -19,7 +19,7 @@ from gp_ground_seg.lab.simulation import (
     Scene,
     objects,
     semantic_kitti_labels,
-    simulate_drive,
+    simulate_scan,
     traffic,
 )
 from gp_ground_seg.lab.simulation.scenes import WetPatch
@@ -200,16 +200,17 @@ def test_tilted_sensor_sees_the_same_world(scene):
 
 
 def test_a_drive_moves_over_the_terrain_and_depends_on_scene_and_seed_only(scene):
-    scans = list(simulate_drive(scene, FEW, n_frames=2, speed=15.0, seed=5))
-    np.testing.assert_allclose([s.time for s in scans], [0.0, 0.1])
-    for s, x in zip(scans, (0.0, 1.5), strict=True):
+    def scan_at(x, seed, scene=scene):
+        return simulate_scan(scene, FEW, np.random.default_rng(seed), x=x)
+
+    for x in (0.0, 1.5):
+        s = scan_at(x, 5)
         foot = s.position - FEW.height * s.rotation[:, 2]
         expected = [x, 0.0, float(scene.terrain.height(x, 0.0))]
         np.testing.assert_allclose(foot, expected, atol=1e-12)
-    again = SCENES[scene.name](7)  # another object, and so scanned anew
-    assert is_same(scans[0], next(simulate_drive(again, FEW, 1, 15.0, 5)))
-    assert not is_same(scans[0], next(simulate_drive(scene, FEW, 1, 15.0, 6)))
-    assert not is_same(scans[0], next(simulate_drive(SCENES[scene.name](8), FEW, 1, 15.0, 5)))
+    assert is_same(scan_at(0.0, 5), scan_at(0.0, 5, SCENES[scene.name](7)))
+    assert not is_same(scan_at(0.0, 5), scan_at(0.0, 6))
+    assert not is_same(scan_at(0.0, 5), scan_at(0.0, 5, SCENES[scene.name](8)))
 
 
 # Hidden, mirrored, and seen from a slope.

@@ -7,11 +7,10 @@ from gp_ground_seg.lab.simulation.scan import (
     OS1_128,
     SENSORS,
     VLP_16,
-    simulate_drive,
     simulate_scan,
 )
 from gp_ground_seg.lab.simulation.scenes import DRIVES, LOW, PLACES, SCENES, STEEP, Scene
 
 __all__ = ['DRIVES', 'HDL_32E', 'HDL_64E', 'LOW', 'OS1_128', 'PLACES', 'SCENES', 'SENSORS']
 __all__ += ['STEEP', 'VLP_16', 'Kind', 'Scene']
-__all__ += ['semantic_kitti_labels', 'simulate_drive', 'simulate_scan']
+__all__ += ['semantic_kitti_labels', 'simulate_scan']

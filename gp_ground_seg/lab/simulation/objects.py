@@ -26,7 +26,7 @@ SMALLEST_RATE = 1e-12  # for a zero component of a unit vector; keeps 0 / 0 out 
 Kind = IntEnum(
     'Kind', 'TERRAIN BOX WALL POLE OVERHANG REFLECTION VEGETATION PERSON CYCLIST', start=0
 )
-"""Kinds of things that a ray can hit."""
+"""What a ray can hit."""
 
 
 # In order of the codes: class in SemanticKITTI, and share of the light that comes back.

@@ -1,9 +1,8 @@
-"""LiDARs, spinning or without rings; their scans of a scene, and drives through it."""
+"""LiDARs, spinning or without rings, and their scans of a scene."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +20,6 @@ from gp_ground_seg.lab.simulation.objects import (
 from gp_ground_seg.lab.simulation.scenes import Scene
 from gp_ground_seg.lab.simulation.terrain import Terrain, first_hit
 
-FRAME_PERIOD = 0.1  # time of one turn of the sensor [s]
 REFLECTION_MIN_DEPTH = 0.1  # a mirrored point less deep below the ground is the road itself [m]
 STANCE = 1.0  # half the length and width of a vehicle on its wheels [m]
 PLUMB_LINE = 200.0  # of a tilted sensor: the search for the ground starts that far above [m]
@@ -159,19 +157,14 @@ class SimulatedScan:
     ground_z: FloatArray
     kind: KindArray  # (N,) `Kind` that the ray hit
     object_id: npt.NDArray[np.int32]  # (N,) number of the vehicle or person hit, 0: of neither
-    time: float  # since the start of the drive [s]
     position: FloatArray  # (3,) of the origin of the cloud's frame in the world [m]
     rotation: FloatArray  # (3, 3) turns vectors of the cloud's frame into the world's
 
 
 def simulate_scan(
-    scene: Scene,
-    sensor: SensorModel,
-    rng: np.random.Generator,
-    x: float = 0.0,
-    time: float = 0.0,
+    scene: Scene, sensor: SensorModel, rng: np.random.Generator, x: float = 0.0
 ) -> SimulatedScan:
-    """Scan the scene at `time` [s], the (first) sensor over the place `x` [m] of the drive.
+    """Scan the scene with the (first) sensor over the place `x` [m] of the drive.
 
     `rng` draws numbers for each ray, whether or not it hits anything: the same generator state
     gives the same noise in another scene.
@@ -185,7 +178,7 @@ def simulate_scan(
     points, kind, object_id = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     ground_z = _ground_below(scene.terrain, points, position, rotation)
     is_ground = kind == Kind.TERRAIN
-    return SimulatedScan(points, is_ground, ground_z, kind, object_id, time, position, rotation)
+    return SimulatedScan(points, is_ground, ground_z, kind, object_id, position, rotation)
 
 
 def _rotation_of_vehicle(scene: Scene, x: float) -> FloatArray:
@@ -293,14 +286,3 @@ def _ground_below(
     down = np.broadcast_to(-up, world.shape)
     fall = first_hit(terrain, world + PLUMB_LINE * up, down, 2.0 * PLUMB_LINE)
     return np.asarray(local[:, 2] + PLUMB_LINE - fall)
-
-
-def simulate_drive(
-    scene: Scene, sensor: SensorModel, n_frames: int, speed: float, seed: int
-) -> Iterator[SimulatedScan]:
-    """Drive along x from the origin at `speed` [m/s], ten scans a second; `seed` is of noise."""
-    rng = np.random.default_rng(seed)
-    return (
-        simulate_scan(scene, sensor, rng, x=speed * k * FRAME_PERIOD, time=k * FRAME_PERIOD)
-        for k in range(n_frames)
-    )

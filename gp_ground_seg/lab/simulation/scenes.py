@@ -349,7 +349,7 @@ def _bank(seed: int) -> Scene:
 
 
 def _on_ramp(seed: int) -> Scene:
-    """Ramp of 15 to 25 % on which the vehicle stands, 9 to 17 m long, level land at both ends."""
+    """Ramp of 15 to 25 %, 9 to 17 m long, between level ground; the vehicle stands on it."""
     rng = np.random.default_rng(seed)
     gradient, behind, ahead = rng.uniform((0.15, 4.0, 5.0), (0.25, 8.0, 9.0)).tolist()
     corners = [(-behind, -gradient * behind), (ahead, gradient * ahead)]
@@ -360,7 +360,7 @@ def _on_ramp(seed: int) -> Scene:
 
 
 def _dike(seed: int) -> Scene:
-    """Dike 5 to 8 m wide, 1 to 2 m above the land on both sides; the vehicle stands on it."""
+    """Dike 5 to 8 m wide, 1 to 2 m above the ground on both sides; the vehicle stands on it."""
     rng = np.random.default_rng(seed)
     heading, gradient = rng.uniform(-math.pi, math.pi), rng.uniform(0.4, 0.7)
     half, high = rng.uniform(2.5, 4.0), rng.uniform(1.0, 2.0)
