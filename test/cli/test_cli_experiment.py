@@ -12,7 +12,7 @@ from evaluation_samples import write_frame, write_streets
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.cli.experiment import EXPERIMENTS, THREE
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.data.semantic_kitti import labelled_frames, read_labels, read_points
+from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
 from gp_ground_seg.lab import table1 as paper_table
 from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.simulation import (
@@ -174,40 +174,30 @@ FIRST = 'sequences/10/velodyne/000000.bin'
 
 
 @pytest.fixture(scope='module')
-def rubble(tmp_path_factory):
-    """Rubble ahead, from segment 90 on."""
+def measured(tmp_path_factory):
+    """Rows of ours with rubble ahead, from segment 90 on; the scan and its classes."""
     folder = tmp_path_factory.mktemp('kitti')
     scan = simulate_scan(SCENES['road_then_rubble'](1), HDL_32E, np.random.default_rng(1), x=12.0)
-    write_frame(folder, '00', 0, scan.points, semantic_kitti_labels(scan.kind))
-    return folder
-
-
-@pytest.fixture(scope='module')
-def frame(rubble):
-    points = read_points(rubble / 'sequences/00/velodyne/000000.bin')
-    return points, read_labels(rubble / 'sequences/00/labels/000000.label', len(points))
-
-
-@pytest.fixture(scope='module')
-def measured(rubble):
+    semantic = semantic_kitti_labels(scan.kind)
+    write_frame(folder, '00', 0, scan.points, semantic)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_table, 'CHOICES', {('00', '000000'): SEGMENTS})
         patch.setattr(paper_table, 'N_REPEATS', 1)
-        rows = table1(labelled_frames(rubble), Config()).rows
-        return [row for row in rows if row['by'] == 'ours']
+        rows = table1(labelled_frames(folder), Config()).rows
+    return [row for row in rows if row['by'] == 'ours'], scan.points, semantic
 
 
 @pytest.mark.parametrize(
     ('method', 'model'), [('Z-L', 'latent'), ('Z', 'line_gradient')], ids=['Z-L', 'Z']
 )
-def test_columns_follow_their_definitions(measured, frame, method, model):
+def test_columns_follow_their_definitions(measured, method, model):
     """Everything anew from a segmentation of its own, but for the times."""
-    points, semantic = frame
+    rows, points, semantic = measured
     z = points[:, 2].astype(float)
     changes = {'length_scale.model': model, 'learning.fixed': 'none'}
     result = GroundSegmenter(Config().replace(**changes)).segment(points)
     candidates, surface = result.candidates, result.surface
-    for row, segment in zip(measured, SEGMENTS, strict=True):
+    for row, segment in zip(rows, SEGMENTS, strict=True):
         own = slice(*candidates.offsets[segment : segment + 2])
         assert row['segment'] == f'00/000000:{segment}'
         assert row['n_PG'] == own.stop - own.start
