@@ -93,82 +93,51 @@ def remove_leftovers(folder: Path, name: str = '') -> None:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a file, and the folders that it is in, as `staged_file` does; it replaces another."""
+    """Write a file, and the folders that it is in, as `staged_file` does; it replaces another.
+
+    What killed runs left of it stays: a folder of many files is searched once, by its writer.
+    """
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    with _staged_file(path, force=True) as part, writing(path):
+    with _staged(path, force=True) as part, writing(path):
         part.write_bytes(data)
 
 
-def staged_file(target: str | Path, *, force: bool) -> AbstractContextManager[Path]:
-    """Return a path to write, for a ``with`` block; at its end the file is renamed to `target`.
+@contextmanager
+def staged_file(
+    target: str | Path, *, force: bool, is_kind: Callable[[Path], bool] = Path.is_file
+) -> Iterator[Path]:
+    """Yield a path to write; at the end of the block the file is renamed to `target`.
 
-    The block raises DataError if the target exists and `force` is false, is not a regular file,
-    or cannot be written.
+    Raises DataError if the target exists and `force` is false, is not of the kind that may be
+    replaced, or cannot be written. A block that writes nothing changes nothing.
     """
-    _remove_leftovers_of(target)
-    return _staged_file(target, force=force)
-
-
-def _staged_file(target: str | Path, *, force: bool) -> AbstractContextManager[Path]:
-    return _staged(target, partial(_check_file, target, force), os.replace)
-
-
-def check_writable(target: str | Path, *, force: bool) -> None:
-    """Raise what `staged_file` would, for a file that is written later; write nothing."""
-    with _staged(target, partial(_check_file, target, force), lambda _product, _path: None):
-        pass
+    path = Path(target).resolve()
+    remove_leftovers(path.parent, path.name)
+    with _staged(target, force=force, is_kind=is_kind) as product:
+        yield product
 
 
 def staged_bag_folder(target: str | Path, *, force: bool) -> AbstractContextManager[Path]:
     """Return the path of a folder to create, as `staged_file`; `force` replaces a rosbag2 only."""
-
-    def check(path: Path) -> None:
-        _refuse_existing(path, target, force)
-        if path.exists() and not is_bag_folder(path):
-            raise DataError(f'{target}: is not a rosbag2 folder, not replaced; remove it yourself')
-
-    def place(product: Path, path: Path) -> None:
-        # A folder cannot be replaced in one step: the old one is renamed, and back if need be.
-        aside = product.with_name(_REPLACED)
-        try:
-            if path.exists():
-                os.rename(path, aside)
-            os.rename(product, path)
-        except BaseException:  # also that of Ctrl-C
-            if aside.exists() and not path.exists():
-                os.rename(aside, path)
-            raise
-
-    _remove_leftovers_of(target)
-    return _staged(target, check, place)
+    return staged_file(target, force=force, is_kind=is_bag_folder)
 
 
-def _remove_leftovers_of(target: str | Path) -> None:
-    path = Path(target).resolve()
-    remove_leftovers(path.parent, path.name)
-
-
-def _check_file(target: str | Path, force: bool, path: Path) -> None:
-    if path.exists() and not path.is_file():
-        raise DataError(f'{target}: is not a file, not replaced')
-    _refuse_existing(path, target, force)
-
-
-def _refuse_existing(path: Path, shown: str | Path, force: bool) -> None:
-    if path.exists() and not force:
-        raise DataError(f'{shown}: exists already; --force replaces it')
+def check_writable(target: str | Path, *, force: bool) -> None:
+    """Raise what `staged_file` would, for a file that is written later."""
+    with staged_file(target, force=force):
+        pass
 
 
 @contextmanager
 def _staged(
-    target: str | Path, check: Callable[[Path], None], place: Callable[[Path, Path], None]
+    target: str | Path, *, force: bool, is_kind: Callable[[Path], bool] = Path.is_file
 ) -> Iterator[Path]:
     """Path with the final name, in a hidden folder beside it that goes away in the end.
 
     The folder is locked. One of a run that was killed is not: the next run removes it.
     """
-    path = Path(target).resolve()
+    path, check = Path(target).resolve(), partial(_check, target, force, is_kind)
     if path.is_symlink():
         raise DataError(f'{target}: {os.strerror(errno.ELOOP)}')
     check(path)
@@ -185,11 +154,9 @@ def _staged(
             product = Path(folder, path.name)
             yield product
             check(path)
-            with writing(target):
-                for part in (*product.rglob('*'), product) if product.exists() else ():
-                    flush(part)
-                place(product, path)
-                flush(path.parent)
+            if product.exists():
+                with writing(target):
+                    _place(product, path)
     except OSError as error:
         if not str(error.filename).startswith(str(hidden)):
             raise  # of something else in the block
@@ -198,3 +165,29 @@ def _staged(
         if str(hidden) not in str(error):
             raise
         raise DataError(str(error).replace(str(product), str(target))) from error
+
+
+def _check(target: str | Path, force: bool, is_kind: Callable[[Path], bool], path: Path) -> None:
+    """Raise DataError if what is there may not be replaced."""
+    if path.exists() and not is_kind(path):
+        kind = 'rosbag2 folder' if is_kind is is_bag_folder else 'file'
+        raise DataError(f'{target}: is not a {kind}, not replaced; remove it yourself')
+    if path.exists() and not force:
+        raise DataError(f'{target}: exists already; --force replaces it')
+
+
+def _place(product: Path, path: Path) -> None:
+    """Flush a file or folder to disk, and give it its name."""
+    for part in (*product.rglob('*'), product):
+        flush(part)
+    # A folder cannot be replaced in one step: the old one is renamed, and back if need be.
+    aside = product.with_name(_REPLACED)
+    try:
+        if path.is_dir():
+            os.rename(path, aside)
+        os.rename(product, path)
+    except BaseException:  # also that of Ctrl-C
+        if aside.exists() and not path.exists():
+            os.rename(aside, path)
+        raise
+    flush(path.parent)

@@ -134,19 +134,19 @@ def test_what_is_missing_or_older_than_its_input_is_done_again(root, tmp_path, c
 
 def test_a_file_has_its_name_when_it_is_on_disk(root, tmp_path, monkeypatch):
     """A power failure leaves no hole in what is finished."""
-    calls, sync, replace = [], os.fsync, os.replace
+    calls, sync, rename = [], os.fsync, os.rename
 
     def note_sync(number):
         sync(number)
         calls.append(Path(os.readlink(f'/proc/self/fd/{number}')))
 
-    def note_replace(source, target):
+    def note_rename(source, target):
         assert source in calls
-        replace(source, target)
+        rename(source, target)
         calls.append(target)
 
     monkeypatch.setattr(os, 'fsync', note_sync)
-    monkeypatch.setattr(os, 'replace', note_replace)
+    monkeypatch.setattr(os, 'rename', note_rename)
     out = tmp_path / 'out'
     assert run('segment', root, '-o', out) == 0
     written = [out / PARAMETERS, *(out / name for name in label_files(out))]

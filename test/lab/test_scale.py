@@ -227,7 +227,7 @@ def test_processes_that_are_stopped_leave_nothing_half_done(moment, victim, tmp_
     for k in range(1, n_scans):
         scan.with_name(f'{k:06d}.bin').hardlink_to(scan)
     words = 'segment', root, '-o', out
-    process = start(*words, '--workers', '2', start_new_session=True)
+    process = start(*words, '--workers', '2', '--quiet', start_new_session=True)
     # The first child is the tracker of resources.
     started = 2 if moment == 'a worker starts' else 3
     wait_for(lambda: len(children(process.pid)) >= started, 'worker')
