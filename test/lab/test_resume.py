@@ -113,8 +113,13 @@ def test_what_is_missing_or_older_than_its_input_is_done_again(root, tmp_path, c
         return capsys.readouterr().out
 
     shutil.copytree(root, source)
-    said('-o', out)
-    inputs, outputs = sorted(source.rglob('*.bin')), sorted(out.rglob('*.label'))
+    inputs = sorted(source.rglob('*.bin'))
+    os.truncate(inputs[9], 10)
+    assert run('segment', source, '-o', out) == 2
+    assert f'{inputs[9]}: 10 bytes is not a whole number' in error_line(capsys)
+    shutil.copyfile(inputs[0], inputs[9])
+    assert said('-o', out).startswith('9 of 12 were finished before\n3 frames, ')
+    outputs = sorted(out.rglob('*.label'))
     shutil.copyfile(inputs[7], inputs[0])
     for output in outputs[1:5]:
         output.unlink()
