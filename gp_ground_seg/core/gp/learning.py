@@ -15,11 +15,9 @@ import numpy as np
 
 from gp_ground_seg.core.frame import (
     BoolArray,
-    Candidates,
     FloatArray,
     Frame,
     Inliers,
-    IntArray,
     PseudoInputs,
     Values,
 )
@@ -192,41 +190,24 @@ def learn_frame(frame: Frame, config: Config) -> Learned:
 
 
 def every_segment(frame: Frame, step: int) -> Frame:
-    """Every `step`-th segment of a frame, by itself and without knots."""
-    no_knots = frame._replace(knots=frame.knots[:0])
-    if step == 1:
-        return no_knots
+    """Frame without knots, and with candidates in every `step`-th segment only."""
     candidates, pseudo = frame.candidates, frame.pseudo
-
-    def thin(offsets: IntArray) -> tuple[IntArray, IntArray]:
-        """Places of the values that are kept, and their offsets."""
-        first, stop = offsets[:-1:step], offsets[1::step]
-        places = [np.arange(*ends) for ends in zip(first.tolist(), stop.tolist(), strict=False)]
-        return np.concatenate(places), np.concatenate([[0], np.cumsum(stop - first)])
-
-    kept, offsets = thin(candidates.offsets)
-    kept_bar, bar_offsets = thin(pseudo.offsets)
-    return no_knots._replace(
-        candidates=Candidates(
-            candidates.r[kept],
-            candidates.z[kept],
-            candidates.bin[kept],
-            candidates.density[kept],
-            offsets,
-            candidates.tile[kept],
-            candidates.x[kept],
-            candidates.y[kept],
-        ),
+    is_used = np.arange(candidates.n_segments) % step == 0
+    kept = is_used[candidates.segment]
+    kept_bar = np.repeat(is_used, np.diff(pseudo.offsets))
+    return frame._replace(
+        candidates=candidates.where(kept),
         lines=frame.lines._replace(line=frame.lines.line[kept]),
         pseudo=PseudoInputs(
             pseudo.r_bar[kept_bar],
             pseudo.log_extent[kept_bar],
-            bar_offsets,
+            np.concatenate([[0], np.cumsum(kept_bar)])[pseudo.offsets],
             pseudo.line[kept_bar],
             pseudo.kind[kept_bar],
         ),
         continues_line=frame.continues_line[kept],
         in_face=frame.in_face[kept],
+        knots=frame.knots[:0],
     )
 
 
