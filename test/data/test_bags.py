@@ -148,6 +148,7 @@ def test_a_bag_is_replaced_with_force_only_and_by_a_whole_one_only(tmp_path, nam
         with BagWriter(path, storage=storage, force=force) as bag:
             bag.add_topic('/points')
             bag.write('/points', 5, encode_cloud(samples.cloud()))
+            assert listing(tmp_path) != files
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
