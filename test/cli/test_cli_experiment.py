@@ -53,7 +53,7 @@ CASES = {
     'scenes --sensors vlp-16 --scenes low_boxes,flat --seeds 1': ('low', 2 * 2),
     'scenes --scenes flat,bank,ramp --sensors vlp-16,mid-360 --seeds 1': ('rough', 2 * 6),
     'scenes --no-peer --sensors vlp-16 --scenes kerb --seeds 1': ('scenes', 1),
-    'objects --sensors vlp-16 --scenes hidden_climb,hedge --seeds 1': ('objects', 4),
+    'objects --sensors vlp-16 --scenes hidden_climb,blind_slope --seeds 1': ('objects', 4),
     'table1 ROOT': ('errors', 2 * 3),
     'table1 --preset paper ROOT --set learning.max_evaluations=4': ('errors', 2 * 3),
     'speed ROOT --frame-step 3 --set grid.n_bins=40': ('times', 2 * 5 * 3),

@@ -117,12 +117,12 @@ def test_interpolation_has_the_median_of_three_segments_and_our_labels(frames):
 
 
 def test_scenes_without_a_free_lane_are_seen_from_the_origin_only():
-    frames = scenes.simulated_frames(['vlp-16'], ['kerb', 'hedge'], 1, (0.0, 6.0))
+    frames = scenes.simulated_frames(['vlp-16'], ['kerb', 'car_park'], 1, (0.0, 6.0))
     places = [(frame.scene, frame.x) for frame in frames]
-    assert places == [('kerb', 0.0), ('kerb', 6.0), ('hedge', 0.0)]
+    assert places == [('kerb', 0.0), ('kerb', 6.0), ('car_park', 0.0)]
 
 
-@pytest.mark.parametrize('scene', ['hidden_climb', 'traffic_jam', 'low_boxes', 'low_walls'])
+@pytest.mark.parametrize('scene', ['hidden_climb', 'traffic_jam', 'low_boxes'])
 def test_objects_of_a_simulated_scan_are_those_that_its_rays_hit(scene):
     """Vehicles, persons and cyclists by their kind; lower ones by the nearest of five heights."""
     objects = scenes.load_simulated(scenes.SimulatedFrame('vlp-16', scene, 1, 0.0)).objects
@@ -158,19 +158,19 @@ def test_scenes_are_scored_by_ours_and_by_the_peer():
 def test_a_scene_that_is_refused_is_said(monkeypatch):
     score = scenes.score_rows
 
-    def refuse_hedges(load, methods, frames, **options):
-        if frames[0].scene == 'hedge':
-            raise PointCloudError('hedge: z does not point up')
+    def refuse_car_parks(load, methods, frames, **options):
+        if frames[0].scene == 'car_park':
+            raise PointCloudError('car_park: z does not point up')
         return score(load, methods, frames, **options)
 
-    monkeypatch.setattr(scenes, 'score_rows', refuse_hedges)
-    frames = scenes.simulated_frames(['vlp-16'], ['hedge', 'low_boxes', 'ramp'], 1, (0.0,))
+    monkeypatch.setattr(scenes, 'score_rows', refuse_car_parks)
+    frames = scenes.simulated_frames(['vlp-16'], ['car_park', 'low_boxes', 'ramp'], 1, (0.0,))
     tables = scenes.score_scenes(frames, FIXED, with_peer=False).tables
-    assert tables['scenes'].notes == ['refused: hedge: z does not point up']
+    assert tables['scenes'].notes == ['refused: car_park: z does not point up']
     names = {'scenes': ['low_boxes', 'ramp'], 'objects': ['ramp'], 'low': ['low_boxes']}
     names['rough'] = ['ramp', 'all']
     assert {key: [r['scene'] for r in tables[key].json()] for key in names} == names
-    with pytest.raises(PointCloudError, match='refused: hedge'):
+    with pytest.raises(PointCloudError, match='refused: car_park'):
         scenes.score_scenes(frames[:1], FIXED, with_peer=False)
 
 
