@@ -151,6 +151,7 @@ class OutputFolder:
     """A folder of output, which a run begins, or goes on with.
 
     Output counts as finished that is newer than its input, and no older than `PARAMETERS`.
+    Raises DataError if the path is that of a file.
 
     Parameters
     ----------
@@ -158,8 +159,6 @@ class OutputFolder:
         Need not exist.
     parameters : str
         All that the output depends on, beside the content of the inputs, for `PARAMETERS`.
-
-    Raises DataError if the path is that of a file.
     """
 
     def __init__(self, path: Path, parameters: str) -> None:
