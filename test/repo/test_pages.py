@@ -45,7 +45,7 @@ OURS = re.compile(
 """Accuracy and speed, which are in figures, with their command."""
 NOT_OURS = re.compile(
     'slopes? of (10 to 15|8) %|(climb|ramp) of (12|15 to 25) %|15 % steep'  # of scenes
-    '|3 % of all|10 % of the height|35 % of all cells'  # constants of the method
+    '|3 % of all|10 % of it|35 % of all cells'  # constants of the method
 )
 
 
