@@ -99,7 +99,7 @@ def to_scores_table() -> str:
     ((*_, number, ours, peer),) = (row for row in objects if row[:2] == ['vehicle', 'all'])
     rows.append([f'vehicles lost, of {number}', ours, peer, ''])
     *_, (_, number, ours, peer, *_) = rows_below(page, 'Low things and false cells')
-    title = f'low things: returns called ground, of {number}'
+    title = f'low objects: returns called ground, of {number}'
     rows.append([title, f'{ours} %', f'{peer} %', ''])
     times = {method: cells for method, *cells in rows_below(PERFORMANCE, 'Time per frame')}
     (ours, _, ratio, _), (peer, *_) = times['learning'], times['Patchwork++']
