@@ -43,6 +43,10 @@ OURS = re.compile(
     r'\d ?%|\d ms\b|[\da-z] times \w*er\b|[\da-z] times as|\w+(th|half|third) of the time'
 )
 """Accuracy and speed, which are in figures, with their command."""
+ODD = re.compile(
+    r'\b(of which|beside|aside|told|things?|the cloud before|holds? for|go(es)? on)\b'
+)
+"""For: such as, next to, given, object, the previous cloud, applies to, continue."""
 NOT_OURS = re.compile(
     'slopes? of (10 to 15|8) %|(climb|ramp) of (12|15 to 25) %|15 % steep'  # of scenes
     '|3 % of all|10 % of it|35 % of all cells'  # constants of the method
@@ -88,6 +92,7 @@ def faults(page, text):
     yield from (f'{image}: a picture without its command' for image in images)
     prose = ' '.join(re.sub('`[^`]*`', '', BLOCK.sub('', rest)).split())
     yield from (f'figure in a sentence: {k[0]}' for k in OURS.finditer(NOT_OURS.sub('', prose)))
+    yield from (f'odd word: {k[0]}' for k in ODD.finditer(prose))
     yield from (f'{link}: no such place' for link in LINK.findall(text) if is_broken(page, link))
     lines = ''.join(commands_of(text)).splitlines()
     yield from (f'{line}: is refused' for line in lines if is_refused(line))
@@ -115,6 +120,7 @@ def test_nothing_is_wrong_with_a_page(page):
             ('no such place', f'[a]({link})')
             for link in ('docs/no.md', 'docs/node.md#no', '#no', 'https://arxiv', 'http://a.org/')
         ),
+        ('odd word', 'It holds for files.'),
         ('is refused', '```sh\ngp-ground-seg plot scan a.bin --no  # a\n```'),
         ('is refused', '```sh\ngp-ground-seg no\n```'),
         ('', 'A slope of 10 to 15 %, `6 ms`, [a](docs/node.md#time-and-tf), [b](https://a.org/1)'),
