@@ -10,7 +10,7 @@ PACKAGE = 'gp_ground_seg'
 README = Path(__file__).resolve().with_name('README.md')
 
 BAGS = ['mcap>=1.5', 'rosbags>=0.11.9']
-EVALUATE = ['pandas>=2.1']
+EVALUATE = ['pandas>=2.1', 'tabulate>=0.9']  # tables, and these as Markdown
 FORMATS = ['python-neo-lzf>=0.3']
 PLOT = ['matplotlib>=3.6']
 SCALE = ['distributed>=2025.1']  # 21 MB

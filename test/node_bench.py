@@ -23,11 +23,11 @@ from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_s
 from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
 from gp_ground_seg.lab.scoring.report import (
-    Column,
+    Form,
     Table,
     describe_environment,
+    frame_of,
     machine_line,
-    milliseconds,
 )
 from gp_ground_seg.ros.node_process import INPUT, OUTPUTS, Link, NodeProcess, private_session
 
@@ -36,12 +36,12 @@ SILENCE = 2.0
 N_SIMULATED = 10
 COUNTS = {'sent': 'n_sent', 'back': 'n_back', 'lost': 'n_lost', 'reported': 'n_dropped'}
 PERCENTILES = {'p50 [ms]': 'p50', 'p95': 'p95', 'p99': 'p99', 'worst': 'worst'}
-COLUMNS = [
-    Column('Rate [Hz]', 'g', 'asked'),
-    Column('sent [Hz]', '.2f', 'sent'),
-    *(Column(title, 'd', key) for title, key in COUNTS.items()),
-    *(milliseconds(title, key) for title, key in PERCENTILES.items()),
-]
+FORMS = {
+    'asked': Form('Rate [Hz]', 'g'),
+    'sent': Form('sent [Hz]', '.2f'),
+    **{key: Form(title, '.0f') for title, key in COUNTS.items()},
+    **{key: Form(title, '.1f', 1e3) for title, key in PERCENTILES.items()},
+}
 
 
 def dropped_by_node(session, arrays):
@@ -179,8 +179,7 @@ def main():
     rates = measure(clouds, given.rates, given.frames, ros_args)
     n_points = sum(map(len, scans)) / len(scans)
     title = f'{given.data or "simulated HDL-64E"}: {len(scans)} clouds of {n_points:.0f} points'
-    columns = {column: [rate[column.key] for rate in rates] for column in COLUMNS}
-    print(Table(columns, title).text())
+    print(Table(title, frame_of(rates)[[*FORMS]], FORMS).text())
     print(machine_line(describe_environment()))
 
 

@@ -22,7 +22,7 @@ from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_c
 from gp_ground_seg.data.files import staged_files
 from gp_ground_seg.data.point_cloud2 import CloudMessage, read_fields, read_xyz
 from gp_ground_seg.lab.plotting import new_figure, plot_scan_view
-from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_labels, label_ratios
+from gp_ground_seg.lab.scoring.metrics import Labels, count_labels, label_ratios, true_labels
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
 from gp_ground_seg.ros.node_process import GROUND, OBSTACLES, Link, NodeProcess, private_session
 from gp_ground_seg.ros.start_stop import needing_ros
@@ -110,7 +110,7 @@ class Tally:
         parts = [np.full(cloud.width, LABELS[topic]) for topic, cloud in back.items()]
         self.label: Labels = np.concatenate(parts).astype(np.uint8)
         semantic = np.concatenate([read_fields(cloud)['label'] for cloud in back.values()])
-        self.truth = GROUNDGRID.truth(semantic, self.xyz[:, 2])
+        self.truth = true_labels(semantic)
         self.n_sent += int(np.isfinite(read_xyz(sent)).all(axis=1).sum())
         self.n_back += len(self.xyz)
         self.counts.update(count_labels(self.label, self.truth))

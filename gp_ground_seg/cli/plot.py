@@ -24,7 +24,7 @@ from gp_ground_seg.lab.plotting import (
     plot_segment,
     segment_at,
 )
-from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
+from gp_ground_seg.lab.scoring.metrics import true_labels
 
 SCAN = """\
 Draw a scan in perspective: ground grey, obstacles orange; with --labels missed ground blue and
@@ -115,7 +115,7 @@ def run(arguments: argparse.Namespace) -> int:
     points, title = _read(arguments)
     truth = None
     if arguments.labels is not None:
-        truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
+        truth = true_labels(read_labels(arguments.labels, len(points)))
     used = options.spare_compiling(config, 1)
     result = GroundSegmenter(used).segment(points)
     if arguments.picture == 'scan':
