@@ -25,7 +25,6 @@ from gp_ground_seg.lab.scoring.evaluate import (
     Scores,
     load_kitti,
     score_methods,
-    sums,
     title_of,
 )
 from gp_ground_seg.lab.scoring.objects import CUT_HEIGHT
@@ -123,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
         scores = score_methods(items, methods, load, runner=runner)
         if changed:
             print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
-        report = tables.evaluation(scores, config, runner.n_workers, cut)
+        report = tables.evaluation(scores, config, runner.n_workers)
         report.facts.update(data=arguments.root, cut=cut)
         parameters = results.parameters_line(report.facts['config_changes'])
         result[:] = [parameters, *_result_lines(scores)]
@@ -186,7 +185,7 @@ def _load_cloud(sequence: str, item: Input) -> KnownScan:
 
 def _result_lines(scores: Scores) -> list[str]:
     """Return a line for each method on all its scans, ours the last."""
-    pooled, lines = tables.measured(sums(scores.scans)), []
+    pooled, lines = tables.measured(scores.scans), []
     medians = scores.scans.groupby('method')['seconds'].median()
     for name in reversed(scores.methods):
         own = pooled.loc[name]

@@ -75,6 +75,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         source = ' KITTI_ROOT' if experiment.labelled else ' --sensors vlp-16'
         example = f'  gp-ground-seg experiment {name}{source} --json {name}.json'
         purpose = description.splitlines()[0].removesuffix('.')
+        if experiment.takes_config:
+            description += (
+                '\n\nWhat it compares it sets itself, over --preset, --config and --set.'
+            )
         child = options.new_parser(names, name, f'{description}\n', example, purpose)
         if experiment.labelled:
             count = {'nargs': '?'} if experiment.sensors else {}

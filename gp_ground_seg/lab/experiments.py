@@ -24,16 +24,13 @@ from gp_ground_seg.lab.scoring.evaluate import (
     OurMethod,
     Scores,
     score_methods,
-    sums,
     title_of,
 )
-from gp_ground_seg.lab.scoring.metrics import Measure
 from gp_ground_seg.lab.scoring.peers import InterpolationMethod, PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import Form, Report, Table, changed_parameters, frame_of
 from gp_ground_seg.lab.scoring.tables import (
     FORMS,
-    IOU,
-    RMSE,
+    MEASURES,
     SHARE,
     SIGNED,
     interval_note,
@@ -103,20 +100,22 @@ def score_variants(
 
 
 def by_method(scores: Scores) -> DataFrame:
-    """Return sums and measures of each method over all scans, and the median error."""
-    medians = scores.scans.groupby('method', sort=False)['median_absolute'].median()
-    found = measured(sums(scores.scans))
-    return found.assign(median_absolute=medians, method=[title_of(name) for name in found.index])
+    """Return sums and measures of each method over all scans, and its title."""
+    found = measured(scores.scans)
+    return found.assign(method=[title_of(name) for name in found.index])
 
 
 def _differences(
-    scores: Scores, measure: Measure, pairs: Sequence[tuple[str, str]]
-) -> tuple[list[Any], list[str | None]]:
-    """Difference of a measure of each pair of methods, and its interval; none to itself."""
-    value = measure(sums(scores.scans))
-    found = [value[a] - value[b] if a != b else None for a, b in pairs]
-    texts = [interval_text(scores, b, measure, ours=a) if a != b else None for a, b in pairs]
-    return found, texts
+    scores: Scores, name: str, pairs: Sequence[tuple[str, str]], prefix: str = ''
+) -> dict[str, list[Any]]:
+    """Columns of the difference of a measure of each pair of methods, and of its interval."""
+    measure, value = MEASURES[name], measured(scores.scans)[name]
+    return {
+        f'{prefix}difference': [value[a] - value[b] if a != b else None for a, b in pairs],
+        f'{prefix}interval': [
+            interval_text(scores, b, measure, ours=a) if a != b else None for a, b in pairs
+        ],
+    }
 
 
 def _counted(scores: Scores) -> str:
@@ -137,20 +136,16 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     scores = score_variants(items, variants, [InterpolationMethod(config)], runner)
     learned, lines = 'Z-L, learned', scores.methods[-1]
     pairs = [pair for pair in [*PAIRS, (learned, lines)] if {*pair} <= {*scores.methods}]
-    iou, iou_interval = _differences(scores, IOU, pairs)
-    rmse, rmse_interval = _differences(scores, RMSE, pairs)
-    rows = [
-        {
-            'pair': ' - '.join(name.partition(',')[0] for name in pair),
-            'theta': ' - '.join(dict.fromkeys(n.partition(', ')[2] for n in pair if n in MODELS)),
-            'iou': iou[k], 'iou_interval': iou_interval[k],
-            'rmse': rmse[k], 'rmse_interval': rmse_interval[k],
-        }
-        for k, pair in enumerate(pairs)
-    ]  # fmt: skip
+    how = [[name.partition(', ')[2] for name in pair if name in MODELS] for pair in pairs]
+    rows = frame_of({
+        'pair': [' - '.join(name.partition(',')[0] for name in pair) for pair in pairs],
+        'theta': [' - '.join(dict.fromkeys(words)) for words in how],
+        **_differences(scores, 'iou', pairs, 'iou_'),
+        **_differences(scores, 'rmse', pairs, 'rmse_'),
+    })  # fmt: skip
     forms = {
-        'iou': Form('IoU', *SIGNED), 'iou_interval': Form('IoU, 95 % interval'),
-        'rmse': Form('RMSE', *SIGNED), 'rmse_interval': Form('RMSE, 95 % interval'),
+        'iou_difference': Form('IoU', *SIGNED), 'iou_interval': Form('IoU, 95 % interval'),
+        'rmse_difference': Form('RMSE', *SIGNED), 'rmse_interval': Form('RMSE, 95 % interval'),
     }  # fmt: skip
     models = by_method(scores)[['method', 'iou', 'rmse', 'median_absolute']]
     title = f'{_counted(scores)}; RMSE and median of the height under true ground'
@@ -160,7 +155,7 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     )
     tables = {
         'models': Table(title, models, _FORMS),
-        'pairs': Table(of_pairs, frame_of(rows), forms),
+        'pairs': Table(of_pairs, rows, forms),
     }
     return make_report(tables, scores, config, changes=MODELS)
 
@@ -189,8 +184,7 @@ def compare_steps(
     names, last = scores.methods, [*steps][-1]
     above = [names[0], *names[: len(steps) - 1], *[last] * len(peers)]
     table = by_method(scores)[['method', 'iou', 'rmse']]
-    difference, interval = _differences(scores, IOU, [*zip(names, above, strict=True)])
-    table = table.assign(difference=difference, interval=interval)
+    table = table.assign(**_differences(scores, 'iou', [*zip(names, above, strict=True)]))
     table = table[['method', 'iou', 'difference', 'interval', 'rmse']]
     title = (
         f'{_counted(scores)}, each by itself; difference to the row above, below the steps to '
@@ -220,7 +214,7 @@ def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner =
         n_evaluations=scans['n_evaluations'].median(),
         learning=stages['learning'].median(),
         seconds=scans['seconds'].median(),
-        interval=_differences(scores, RMSE, pairs)[1],
+        interval=_differences(scores, 'rmse', pairs)['interval'],
     )
     title = (
         f'{_counted(scores)}; candidates of a line for each pseudo-input; n_L: pseudo-inputs of a '

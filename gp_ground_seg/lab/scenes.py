@@ -32,10 +32,6 @@ from gp_ground_seg.lab.scoring.objects import (
     CLASSES,
     LOW_CLASSES,
     LOW_HEIGHTS,
-    LOW_MIN_HEIGHT,
-    LOW_MIN_RETURNS,
-    MIN_HEIGHT,
-    MIN_RETURNS,
     Objects,
 )
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
@@ -146,9 +142,10 @@ def score_scenes(
 ) -> Report:
     """Score simulated scans by exact labels and heights, and count objects and low things lost.
 
-    Patchwork++ beside it has its published parameters and the true height and place of the
-    sensor. All sensors have one set of parameters. Low things, and rough and steep ground, have
-    tables of their own.
+    An object is lost if more than half of its returns from 0.3 m above the ground are called
+    ground; returns on low things count from 0.1 m on. Patchwork++ beside it has its published
+    parameters and the true height and place of the sensor. All sensors have one set of
+    parameters. Low things, and rough and steep ground, have tables of their own.
     """
     scores, refused = score_simulated(frames, config, runner, with_peer=with_peer)
     scene_of = {name: name.split()[1] for name in scores.sequences}
@@ -207,58 +204,38 @@ def _placed(table: DataFrame) -> DataFrame:
     return table
 
 
-def _measured(scores: Scores) -> DataFrame:
-    """Return sums and measures of each method in each sequence."""
-    by_sequence = scores.scans.groupby(['method', 'sequence'], sort=False)
-    medians = by_sequence['median_absolute'].median()
-    return measured(sums(scores.scans, 'sequence')).assign(median_absolute=medians)
-
-
 def _scene_table(scores: Scores, refused: Sequence[str]) -> Table:
-    """One row for each sensor and scene; a note says where the peer is ahead in IoU."""
+    """One row for each sensor and scene; notes say what is left out."""
     compared = 'iou', 'rmse', 'median_absolute'
-    found = _measured(scores)[[*compared, 'without_model']]
+    found = measured(scores.scans, 'sequence')[[*compared, 'without_model']]
     table = beside(found, scores.methods, *compared)
-    notes = [*refused]
     title = (
         'Simulated scans: IoU against exact labels [%], every point counts; height of the '
         'surface under true ground [cm]; gaps: share of it without a model [%]'
     )
     for peer in scores.methods[1:]:
         table['interval'] = [interval_text(scores.of([one]), peer, IOU) for one in table.index]
-        is_tie = table['interval'].str.endswith('tie').fillna(False).astype(bool)
-        is_ahead = (table['difference'] > 0.0) & ~is_tie
-        behind = ', '.join(table.index[~is_ahead & ~is_tie])
-        title += peer_note(scores, ', which gets the true sensor height; its surface is the '
-                           'nearest patch; 95 % interval: bootstrap over the scenes of each row, '
-                           'which are few; tie: it holds 0')  # fmt: skip
-        notes.append(
-            f'ahead of {title_of(peer)} on {is_ahead.sum()} of {len(table)} rows, a tie on '
-            f'{is_tie.sum()}; behind on {behind or "none"}'
-        )
+        title += f'; peer: {title_of(peer)}, with the true height; its surface: the nearest patch'
+        title += '; 95 % interval: bootstrap over the scenes of a row, which are few'
     forms = {**FORMS, 'without_model': FORMS['without_model']._replace(title='gaps')}
-    return Table(title, _placed(table), forms, notes)
+    return Table(title, _placed(table), forms, refused)
 
 
 def _lost_table(scores: Scores) -> Table:
     """Objects lost; ours, then the peer if there is one."""
     kinds = scores.objects.assign(kind=scores.objects['class'].map(COUNTED))
     counts = sums(kinds.dropna(subset='kind'), 'sequence', 'kind')
-    found = _measured(scores)[['iou']]
+    found = measured(scores.scans, 'sequence')[['iou']]
+    forms = dict(FORMS)
     for kind in dict.fromkeys(COUNTED.values()):
         own = counts[counts.index.get_level_values('kind') == kind].droplevel('kind')
         own = own.reindex(found.index, fill_value=0)
         found = found.assign(**{kind: own['n_objects'], f'lost_{kind}': own['n_lost']})
+        forms |= {kind: Form(kind, *COUNT), f'lost_{kind}': Form('lost', *COUNT)}
     lost = [name for name in found if name.startswith('lost_')]
     table = beside(found, scores.methods, 'iou', *lost).drop(columns='difference', errors='ignore')
-    title = (
-        'IoU of the ground against exact labels [%]; vehicles, persons and cyclists with at '
-        f'least {MIN_RETURNS} returns from {MIN_HEIGHT:g} m above the exact ground, and how many '
-        'are lost: more than half of these returns called ground'
-    )
+    title = 'IoU of the ground against exact labels [%]; vehicles, persons, cyclists; those lost'
     title += peer_note(scores, ', which gets the true height and place of the sensor')
-    counted = {name: Form(name, *COUNT) for name in table if name in COUNTED.values()}
-    forms = {**FORMS, **counted, **{name: Form('lost', *COUNT) for name in lost}}
     return Table(title, _placed(table), forms)
 
 
@@ -270,11 +247,7 @@ def _low_table(scores: Scores) -> Table:
     things = sums(low, 'sequence')['n_objects'].to_frame('things')
     found = things.join(shares.reindex(columns=[*LOW_CLASSES]))
     table = beside(found, scores.methods, *LOW_CLASSES)
-    title = (
-        'Low things by height, in plain view 3 to 20 m away: those with at least '
-        f'{LOW_MIN_RETURNS} returns from {LOW_MIN_HEIGHT:g} m above the exact ground, and the '
-        'share of them that is lost [%]: more than half of these returns called ground'
-    )
+    title = 'Low things by height, in plain view 3 to 20 m away, and the share that is lost [%]'
     forms = {name: Form(name.removeprefix('low, '), '.0f', 100.0) for name in LOW_CLASSES}
     forms['things'] = Form('things', *COUNT)
     return Table(title + peer_note(scores), _placed(table), forms)
@@ -282,7 +255,7 @@ def _low_table(scores: Scores) -> Table:
 
 def _rough_table(scores: Scores) -> Table:
     """One row for each scene, over its sensors, and one for all."""
-    found = _measured(scores).reset_index()
+    found = measured(scores.scans, 'sequence').reset_index()
     found['scene'] = found['sequence'].str.split().str[1]
     how = {'n_scans': 'sum', 'n_objects': 'sum', 'iou': 'mean', 'rmse': 'mean', 'n_lost': 'sum'}
     found = found.groupby(['method', 'scene'], sort=False).agg(how)
@@ -291,9 +264,8 @@ def _rough_table(scores: Scores) -> Table:
     means.update(table.filter(like='n_').sum())
     table.loc[ALL] = means
     title = (
-        'Rough and steep ground, means over the sensors: IoU against exact labels [%], every '
-        'point counts; RMSE of the surface under true ground [cm]; vehicles, persons and crates, '
-        'and how many of these objects are lost, as in the other tables'
+        'Rough and steep ground, means over the sensors: IoU against exact labels [%]; RMSE of '
+        'the surface [cm]; vehicles, persons and crates, and those lost'
     )
     title += peer_note(scores, ', which gets the true height')
     return Table(title, table.reset_index(), FORMS)

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from cli_runner import error_line, run
+from cli_runner import run
 from evaluation_samples import scores_of, street, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
@@ -222,24 +222,3 @@ def test_scans_without_labels_have_points_that_differ_and_time_only(strict, tmp_
     assert f'{tmp_path.name}/0.bin ({share_changed(0):.2%})' in said.replace('\n  ', ' ') or (
         f'{tmp_path.name}/0 ({share_changed(0):.2%})' in said.replace('\n  ', ' ')
     )
-
-
-@pytest.mark.parametrize(
-    ('words', 'message'),
-    [
-        (['ROOT', '--against', 'default'], '--against default: the same parameters as given'),
-        (['ROOT', '--against', 'no.yaml'], 'no.yaml: No such file'),
-        (['no', '--against', 'paper'], 'no: no such file or folder'),
-        (['ROOT', '--against', 'paper', '--sequences', '99'], 'no sequence 99'),
-        (['ROOT', '--against', 'paper', '--peer', 'patchworkpp'], '--against: compares with p'),
-        *((['SCAN', '--against', 'paper', option, '2'], f'{option}: ')
-          for option in ('--sequences', '--frame-step', '--cut', '--workers')),
-        (['SCAN'], 'no sequences/*/velodyne folder below it (SemanticKITTI layout); scans without '
-         'labels need --against'),
-    ],
-)  # fmt: skip
-def test_bad_input_is_one_line(words, message, root, capsys):
-    scan = root / 'sequences/00/velodyne/000000.bin'
-    given = {'ROOT': root, 'SCAN': scan}
-    assert run('evaluate', *(given.get(word, word) for word in words)) == 2
-    assert message in error_line(capsys)

@@ -82,8 +82,8 @@ class Table(NamedTuple):
         return records(self.frame)
 
 
-def frame_of(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> DataFrame:
-    """Return a frame of rows, or an empty one of the columns."""
+def frame_of(rows: Any, columns: Sequence[str] | None = None) -> DataFrame:
+    """Return a frame of rows or of columns by name, or an empty one of the `columns`."""
     pandas = require_pandas()
     # Without a row pandas knows no type, and sums up no column.
     return pandas.DataFrame(rows) if rows else pandas.DataFrame(columns=columns, dtype=float)

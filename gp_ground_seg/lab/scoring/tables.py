@@ -8,6 +8,7 @@ narrow than too wide.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,6 +48,8 @@ MEASURES: dict[str, Measure] = {
 }
 """What is measured of sums over scans."""
 IOU, RMSE = MEASURES['iou'], MEASURES['rmse']
+HEIGHTS = 'without_model', 'bias', 'rmse', 'median_absolute', 'within_1', 'within_2'
+"""Measures of the heights that are shown."""
 SHARE, SIGNED, COUNT = ('.2f', 100.0), ('+.2f', 100.0), (',.0f',)
 """Formats and factors: of ratios in percent, and of metres in cm; of their differences; counts."""
 FORMS = {
@@ -191,15 +194,25 @@ def beside(found: DataFrame, methods: list[str], *compared: str) -> DataFrame:
     return both.assign(difference=both['iou'] - both['peer_iou']) if 'iou' in compared else both
 
 
-def measured(found: DataFrame) -> DataFrame:
-    """Return sums with the `MEASURES` of those that there are."""
-    columns = {}
+def with_measures(sums: DataFrame) -> DataFrame:
+    """Return sums, and the `MEASURES` that they have."""
+    columns = dict[str, Any]()
     for name, measure in MEASURES.items():
-        try:
-            columns[name] = measure(found)
-        except KeyError:  # no labels, no heights, no low things
-            continue
-    return found.assign(**columns)
+        with suppress(KeyError):  # no labels, no heights, no low things
+            columns[name] = measure(sums)
+    return sums.assign(**columns)
+
+
+def measured(rows: DataFrame, *by: str) -> DataFrame:
+    """Return the sums of each method, or of each group in it, with the `MEASURES` that they have.
+
+    The median error of the height is that of the scans.
+    """
+    found = with_measures(sums(rows, *by))
+    if 'median_absolute' in rows:
+        groups = rows.groupby(['method', *by], sort=False)
+        found['median_absolute'] = groups['median_absolute'].median()
+    return found
 
 
 def make_report(tables: dict[str, Table], scores: Scores, base: Config, **facts: Any) -> Report:
@@ -214,7 +227,7 @@ def make_report(tables: dict[str, Table], scores: Scores, base: Config, **facts:
         'stages': stages.to_dict('index'),
     }
     backend = str(scores.scans['backend'].iloc[0])
-    return Report(tables, records(measured(scores.scans)), backend, {**given, **facts})
+    return Report(tables, records(with_measures(scores.scans)), backend, {**given, **facts})
 
 
 def peer_note(scores: Scores, note: str = '') -> str:
@@ -222,17 +235,14 @@ def peer_note(scores: Scores, note: str = '') -> str:
     return ''.join(f'; peer: {title_of(name)}{note}' for name in scores.methods[1:])
 
 
-def evaluation(
-    scores: Scores, config: Config, n_workers: int = 0, cut: float = objects.CUT_HEIGHT
-) -> Report:
+def evaluation(scores: Scores, config: Config, n_workers: int = 0) -> Report:
     """Report of our method with `config`, and of at most one other method on the same scans.
 
-    Scans without labels have tables of time and of differing labels only. `cut` is the height at
-    which objects were cut [m].
+    Scans without labels have tables of time and of differing labels only.
     """
     tables: dict[str, Table] = {}
     if scores.has_truth:
-        tables |= _sequence_tables(scores, cut)
+        tables |= _sequence_tables(scores)
         tables['rings'] = _ring_table(scores)
     if len(scores.objects):
         tables['objects'] = _object_table(scores)
@@ -243,43 +253,32 @@ def evaluation(
     return make_report(tables, scores, config, reliability=records(bins))
 
 
-def _sequence_tables(scores: Scores, cut: float) -> dict[str, Table]:
+def _sequence_tables(scores: Scores) -> dict[str, Table]:
     """Labels, shares and heights by sequence and pooled. A further measure is a column here."""
     rows = with_all(scores.scans)
-    by_sequence = rows.groupby(['method', 'sequence'], sort=False)
-    found = measured(sums(rows, 'sequence'))
-    found['median_absolute'] = by_sequence['median_absolute'].median()
+    found = measured(rows, 'sequence')
     bins = sums(with_all(scores.bins), 'sequence', 'bin').groupby(['method', 'sequence'])
     found['ece'] = bins[['n', 'n_ground', 'p']].apply(metrics.calibration_error)
     shares = [column for name in objects.SHARES for column in (f'{name}_n', name)]
-    heights = 'without_model', 'bias', 'rmse', 'median_absolute', 'within_1', 'within_2'
-    low = (
-        f'low: returns left of objects that are cut at {cut:g} m, more than '
-        f'{objects.LOW_OVER:g} m over the ground and within {objects.LOW_RANGE:g} m, and the '
-        'share called ground; '
-    ) * (cut > 0.0)
     parts = {
         'groundgrid': (
             'GroundGrid convention: vegetation left out [%]',
-            ('n_scans', *metrics.LABEL_MEASURES), ('iou',),
+            ['n_scans', *metrics.LABEL_MEASURES], ['iou'],
         ),
         'low_things': (
-            f'Low things and false cells [%]; {low}cells of {objects.FALSE_SIZE:g} m within '
-            f'{objects.FALSE_RANGE:g} m that hold labelled road or ground, false: a return of it '
-            f'is called obstacle and is {objects.FALSE_OVER:g} m or more over the surface',
+            'Low things and false cells [%]',
             [name for name in shares if name in found], [*objects.SHARES],
         ),
         'heights': (
-            'Height of the ground under returns labelled ground, those without a model left out '
-            '[cm]; shares within one and two standard deviations [%]; expected calibration error '
-            f'of the probabilities over {metrics.N_BINS} bins',
-            ('n_points', *heights, 'ece'), ('rmse',),
+            'Height of the ground under returns labelled ground [cm]; shares without a model and '
+            'within one and two standard deviations [%]; calibration error of the probabilities',
+            ['n_points', *HEIGHTS, 'ece'], ['rmse'],
         ),
     }  # fmt: skip
     return {
         name: Table(
             title + peer_note(scores),
-            beside(found[[*columns]], scores.methods, *compared).reset_index(),
+            beside(found[columns], scores.methods, *compared).reset_index(),
             FORMS,
         )
         for name, (title, columns, compared) in parts.items()
@@ -289,7 +288,7 @@ def _sequence_tables(scores: Scores, cut: float) -> dict[str, Table]:
 def _ring_table(scores: Scores) -> Table:
     """Labels by horizontal range, with the intervals of the differences of the IoU."""
     rows = with_all(scores.rings, 'range')
-    found = measured(sums(rows, 'range'))
+    found = measured(rows, 'range')
     found['points'] = found[[*COUNTS]].sum(axis='columns')
     found['errors'] = found['fp'] + found['fn']
     whole = found.loc[(scores.methods[0], ALL), 'errors']
@@ -313,27 +312,22 @@ def _object_table(scores: Scores) -> Table:
         place for name in objects.CLASSES for band in (*objects.BAND_TITLES, ALL)
         if (place := (name, band)) in parts
     ]  # fmt: skip
-    found = measured(sums(rows, 'class', 'range'))
+    found = measured(rows, 'class', 'range')
     found['n_lost'] = found['n_lost'].where(found['n_objects'] > 0)
     found = found[['n_returns', 'share_ground', 'n_objects', 'n_lost', 'n_unknown']]
     table = beside(found, scores.methods, 'share_ground', 'n_lost').loc[places]
-    title = (
-        f'Objects: returns on them from {objects.MIN_HEIGHT:g} m above the local ground, and the '
-        f'share called ground [%]; objects with at least {objects.MIN_RETURNS} such returns, and '
-        'how many of them are lost: more than half of these returns called ground; no ground '
-        'near: returns that do not count, as no labels near them are ground'
-    )
+    title = 'Objects: returns on them, and the share called ground [%]; objects, and those lost'
     for peer in scores.methods[1:]:
         ground = MEASURES['share_ground']
         table['interval'] = [interval_text(scores, peer, ground, parts[k]) for k in places]
-        title += peer_note(scores, f'; interval of the share as ground, {interval_note(scores)}')
+        title += peer_note(scores, f'; of the share as ground: {interval_note(scores)}')
     return Table(title, table.reset_index(), FORMS)
 
 
 def difference_table(scores: Scores) -> Table:
     """Compare two methods by `COMPARED`; measures without data in the scans are left out."""
     other = scores.methods[1]
-    found = measured(sums(scores.scans)).loc[[scores.methods[0], other]]
+    found = measured(scores.scans).loc[[scores.methods[0], other]]
     found = found[[name for name in COMPARED if name in found]].dropna(axis='columns', how='all')
     scales = [1e3 if name == 'seconds' else 100.0 for name in found]
     rows = [
