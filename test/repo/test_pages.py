@@ -115,7 +115,7 @@ def test_nothing_is_wrong_with_a_page(page):
         *(
             ('in a sentence', f'It {said}.')
             for said in ('has 2.5 % more', 'has an RMSE of 5.95 cm', 'takes 6 ms',
-                         'is two times faster', 'takes 8 times as long', 'takes an eighth of the time')
+                         'is two times faster', 'takes 8 times as long', 'takes half of the time')
         ),
         *(
             ('no such place', f'[a]({link})')
