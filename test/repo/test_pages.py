@@ -41,7 +41,7 @@ LINK = re.compile(r'\]\(([^)\s]+)\)')
 ADDRESS = re.compile(r'https://[\w.-]+\.[a-z]+(/[\w./~%-]*)?(#[\w-]+)?')
 OURS = re.compile(
     r'\d ?%|\d ms\b|(IoU|RMSE) \D{,9}\d\.\d'
-    r'|[\da-z] times (\w*er|as)\b|\w+(th|half|third) of the time'
+    r'|[\da-z] times (\w*er|as)\b|(\w+th|half|third) of the time'
 )
 """Accuracy and speed, which are in figures, with their command."""
 ODD = re.compile(
