@@ -19,7 +19,7 @@ import numpy.typing as npt
 from gp_ground_seg.core.errors import ConfigError, in_thousands, require
 from gp_ground_seg.core.frame import OUTSIDE, BoolArray, FloatArray, Label
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.pipeline.points import check_points
+from gp_ground_seg.core.pipeline.points import take_points
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.files import staged_file, writing
 from gp_ground_seg.lab.scoring.metrics import (
@@ -110,7 +110,7 @@ def plot_scan_view(
     where a point does not count, the errors too. `camera` is in the sensor frame [m]. In a PDF
     or SVG points are pixels.
     """
-    xyz = check_points(points)
+    xyz = take_points(points).astype(np.float64)
     check_lengths(len(xyz), label=label, truth=truth)
     said, layers = label_layers(label, truth)
     figure, foot = new_figure(WIDTH, HEIGHT + FOOT), FOOT / (HEIGHT + FOOT)
@@ -213,7 +213,7 @@ def plot_segment(
     labels, UNKNOWN where a point does not count. The axes end a little beyond the last candidate.
     The file `path` is replaced.
     """
-    z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
+    z = result.pose.level(take_points(points).astype(np.float64))[:, 2].astype(np.float64)
     check_lengths(len(z), result=result.label, truth=truth)
     views = [SegmentView(result, segment, z) for segment in segments]
     figure = new_figure(5.0 + 6.5 * len(views), 7.6)
