@@ -365,16 +365,6 @@ class Bench(Link):
         wait_for(lambda: publisher.get_subscription_count() == 1, f'ear of {topic}')
         return collector
 
-    @contextlib.contextmanager
-    def changed(self, values):
-        """Other values of parameters within the block."""
-        before = {name: self.node.config[name] for name in values}
-        try:
-            assert all(result.successful for result in self.load(values))
-            yield
-        finally:
-            self.load(before)
-
     def in_executor(self, function, *arguments):
         """Result of a call made between two waits, where entities may safely go."""
         task = self.node.executor.create_task(function, *arguments)

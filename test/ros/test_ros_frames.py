@@ -88,13 +88,6 @@ def test_given_tilt_levels_and_leaves_the_points_as_they_are():
         model = b.listen('~/ground_model')
         parts = b.segment(message)
         cloud = model.wait(1)[0]
-        if not HAS_TF2:
-            # Asked for live it is refused, and the node goes on.
-            assert 'needs tf2_ros' in b.refusal('frame.level', 'tf')
-            assert b.node.config.frame.level == 'sensor'
-            assert not b.set('frame.base', 'two words').successful
-            assert b.set('frame.base', 'base_footprint').successful
-            b.segment(message)
     check_levelled(points, message, parts)
     # The model lies in the frame of the cloud, on its points of ground.
     assert cloud.header == message.header

@@ -223,6 +223,7 @@ def started_with(path):
     namespace, name = ros.NAMESPACE, ros.NODE_NAME
     words = '-r', f'__ns:={namespace}', '-r', f'__node:={name}', '--params-file', str(path)
     with ros.started_node(*words) as node:
+        assert not node._input._is_pinned  # it follows the publishers, as without a file
         return node.config
 
 

@@ -296,10 +296,3 @@ def test_best_effort_driver_with_the_large_segment_profile(node, tmp_path):
         # Fast DDS only warns about a profile that it cannot read, and goes on without.
         assert 'XML' not in driver.log
     assert 'points (best_effort' in node.log
-
-
-@pytest.mark.usefixtures('node')
-def test_a_best_effort_subscriber_is_served():
-    with ros.linked(BEST_EFFORT, BEST_EFFORT) as link:
-        answers = link.ground.messages, link.obstacles.messages
-        link.publish_until(to_message(street(500)), lambda: all(answers), 'clouds')

@@ -2,7 +2,6 @@
 
 import importlib.util
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -12,7 +11,6 @@ import pytest
 import ros_helpers as ros
 from bag_samples import write_ros2_bag
 from cli_runner import children, is_running, stat_words
-from conftest import REPOSITORY
 from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 
 from gp_ground_seg.core.jit import HAVE_NUMBA
@@ -158,31 +156,6 @@ def test_unused_files_are_warned_of_with_their_keys(tmp_path):
         node.wait_until_ready('not used')
         (line,) = [line for line in node.log.splitlines() if 'WARN' in line]
         assert f'those of b, /c/d, and this node is {NAMESPACE}/ground_segmentation_node' in line
-
-
-@pytest.mark.slow
-def test_a_file_as_the_readme_has_it(tmp_path):
-    """The block that writes a file of parameters, line for line, but for where the files are."""
-    readme = (REPOSITORY / 'README.md').read_text(encoding='utf-8')
-    blocks = re.findall(r'```sh\n(.*?)```', readme, re.DOTALL)
-    (block,) = [block for block in blocks if 'config dump' in block]
-    *commands, node_command = block.splitlines()
-    (tmp_path / 'demo_output').mkdir()  # made by `make demo`
-    script = f'gp-ground-seg() {{ {sys.executable} -m gp_ground_seg "$@"; }}; set -e\n'
-    command = ['bash', '-c', script + '\n'.join(commands)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert 'my.yaml: good; ' in done.stdout
-    assert done.stdout.endswith(', 1 differs from the defaults\n')
-    program, *words = node_command.split()
-    assert program == 'gp-ground-seg'
-    words[words.index('demo_output/my.yaml')] = str(tmp_path / 'demo_output' / 'my.yaml')
-    words += ['-p', 'grid.n_bins:=55']
-    with Process(*words, folder=tmp_path, start=('-m', 'gp_ground_seg')) as node:
-        node.wait_until_ready('listening to /velodyne_points')
-        assert 'sensor.height: 1.2 m  (default auto)' in node.log
-        assert 'grid.n_bins: 55  (default 80)' in node.log
-        assert_good_end(node, signal.SIGINT)
 
 
 # Signals to the node: it ends with code 0, after the cloud at hand.
