@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from gp_ground_seg.core.errors import DataError, GroundSegError, in_one_line
+from gp_ground_seg.core.errors import DataError
 
 POINT_CLOUD2 = 'sensor_msgs/msg/PointCloud2'
 METADATA_FILE = 'metadata.yaml'
@@ -16,13 +14,13 @@ STORAGE_OF_SUFFIX = {suffix: storage for storage, suffix in SUFFIX_OF_STORAGE.it
 BAG_SUFFIXES = ('.bag', *STORAGE_OF_SUFFIX)
 
 _FOLDER_SUFFIXES = ('.mcap', '.db3', '.db3-shm', '.db3-wal', '.zstd', '.zst')
-# Suffix of a damaged bag, '' for a folder -> what can repair it.
-_REPAIR = {
+REPAIR = {
     '.bag': '`rosbag reindex` saves the readable part',
     '.mcap': '`mcap recover` saves the readable part',
     '.db3': '`sqlite3 .recover` saves the readable part',
     '': '`ros2 bag reindex` writes metadata.yaml anew',
 }
+"""What can repair a damaged bag, by its suffix; '' for a folder."""
 
 
 def is_bag_folder(path: Path) -> bool:
@@ -92,16 +90,3 @@ def resolve_storage(path: str | Path, wanted: str | None = None) -> str:
     if storage == 'sqlite3':
         check_sqlite_path(Path(path))
     return storage
-
-
-@contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Raise errors of parsing a bag as `DataError` with its path."""
-    try:
-        yield
-    except GroundSegError:
-        raise
-    except Exception as error:  # Of many types: struct, sqlite3, lz4, asserts, ...
-        repair = _REPAIR['' if path.is_dir() else path.suffix]
-        said = f'{in_one_line(error)} (if it is damaged, {repair})'
-        raise DataError(f'{path}: cannot be read as a bag: {said}') from error

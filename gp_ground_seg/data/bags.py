@@ -25,15 +25,15 @@ from gp_ground_seg.core.errors import DataError, PointCloudError, in_one_line, r
 from gp_ground_seg.data.bag_files import (
     METADATA_FILE,
     POINT_CLOUD2,
+    REPAIR,
     STORAGE_OF_SUFFIX,
     SUFFIX_OF_STORAGE,
     check_sqlite_file,
-    reading,
     resolve_storage,
     storage_of,
 )
 from gp_ground_seg.data.clouds import check_numbers, gather
-from gp_ground_seg.data.files import staged_bag_folder, staged_file, writing
+from gp_ground_seg.data.files import naming, staged_bag_folder, staged_file, writing
 from gp_ground_seg.data.point_cloud2 import DATATYPES, CloudMessage
 
 
@@ -141,9 +141,9 @@ class BagReader(AbstractContextManager['BagReader']):
     def __init__(self, path: str | Path) -> None:
         require('rosbags.highlevel', 'rosbags mcap')
         self.path = Path(path)
+        self.storage = storage_of(self.path)
         with ExitStack() as stack:
-            with reading(self.path):
-                self.storage = storage_of(self.path)
+            with self._naming():
                 is_ros2 = self.path.is_dir() or self.storage == 'sqlite3'
                 open_ros = _open_ros1 if self.storage == 'ros1' else _open_mcap
                 channels, self._read = (_open_ros2 if is_ros2 else open_ros)(self.path, stack)
@@ -161,6 +161,10 @@ class BagReader(AbstractContextManager['BagReader']):
     def __exit__(self, *error: object) -> None:
         """Close the files; nothing can be read afterwards."""
         self._open.close()
+
+    def _naming(self) -> AbstractContextManager[None]:
+        repair = REPAIR['' if self.path.is_dir() else self.path.suffix]
+        return naming(self.path, f'cannot be read as a bag; if it is damaged, {repair}')
 
     def _list_topics(self) -> str:
         return ', '.join(f'{name} ({kind})' for name, kind in self.topics.items()) or 'none'
@@ -205,7 +209,7 @@ class BagReader(AbstractContextManager['BagReader']):
         source = self._read(expected)
         while True:
             # Errors of the caller, raised at the yield, must not pass through here.
-            with reading(self.path):
+            with self._naming():
                 message = next(source, None)
             if message is None:
                 break

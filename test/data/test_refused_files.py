@@ -88,7 +88,7 @@ def write_long_record(path):
         file.write(struct.pack('<I', 3_000_000_000))
 
 
-NO_BAG = 'cannot be read as a bag: '
+NO_BAG = 'cannot be read as a bag; '
 REFUSED = {
     'missing.npy': (None, 'no such file or folder'),
     'notes.docx': (b'hello', r'not a scan or bag; accepted are \.bin, \.pcd'),
