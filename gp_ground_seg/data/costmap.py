@@ -23,6 +23,7 @@ from gp_ground_seg.core.frame import (
     Label,
     PointArray,
 )
+from gp_ground_seg.core.ground_model import segment_of
 from gp_ground_seg.core.parameters.config import ANY_HEIGHT, Config
 from gp_ground_seg.core.pipeline.sensor_pose import LEAST_COSINE
 from gp_ground_seg.core.result import Segmentation, cached_property
@@ -185,10 +186,7 @@ def reach_of_model(surface: GroundSurface, heading: FloatArray, tolerance: float
     reach = np.append(0.0, surface.knots)[is_known.sum(axis=1)]
     middle = (np.arange(DIRECTIONS) + 0.5) * (2.0 * math.pi / DIRECTIONS) - math.pi
     x, y = heading @ np.stack([np.cos(middle), np.sin(middle)])
-    n_segments = len(reach)
-    turn = np.arctan2(y, x) / (2.0 * math.pi) + 0.5
-    segment = (turn * n_segments).astype(np.int64) % n_segments
-    return np.asarray(reach[segment], dtype=np.float32)
+    return np.asarray(reach[segment_of(x, y, len(reach))], dtype=np.float32)
 
 
 @np.errstate(over='ignore')

@@ -16,11 +16,12 @@ the one behind goes up to the edge of a long ramp. And few of the steps go on as
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray
+from gp_ground_seg.core.ground_model import segment_of
 
 SECTORS = 360
 """Sectors of azimuth, counter-clockwise from -x, that steps are looked for in."""
@@ -100,17 +101,8 @@ class _Returns(NamedTuple):
     is_ground: BoolArray  # (n,)
     n_standing: IntArray  # (n + 1,) how many before each stand on the ground
 
-    @property
-    def z(self) -> FloatArray:
-        """Height, (n,) [m]."""
-        value: FloatArray = self.xyz[2]
-        return value
-
-    @property
-    def sight(self) -> FloatArray:
-        """Downward slope of the line of sight to each, (n,)."""
-        value: FloatArray = -self.xyz[2] / self.r
-        return value
+    z: FloatArray  # (n,) height [m]
+    sight: FloatArray  # (n,) downward slope of the line of sight
 
 
 class _Steps(NamedTuple):
@@ -124,13 +116,8 @@ class _Steps(NamedTuple):
 
     def where(self, kept: IntArray | BoolArray) -> _Steps:
         """Those of an index or a mask."""
-        return _Steps(
-            self.upper[kept],
-            self.lower[kept],
-            self.fall[kept],
-            self.before[:, kept],
-            self.is_on_slope[kept],
-        )
+        taken: list[Any] = [values[..., kept] for values in self]
+        return _Steps(*taken)
 
 
 def find_edges(
@@ -186,16 +173,16 @@ def _sort(xyz: FloatArray, is_ground: BoolArray, stands: BoolArray) -> _Returns:
     r = np.hypot(x, y)
     kept = np.flatnonzero((r > NEAREST) & (r < FARTHEST) & (z < 0.0) & (z > -FARTHEST))
     x, y, z, r = (values[kept] for values in (x, y, z, r))
-    turn = np.arctan2(y, x) / (2.0 * math.pi) + 0.5
-    sector = (turn * SECTORS).astype(np.int64) % SECTORS
+    sector = segment_of(x, y, SECTORS)
     level = ((np.arctan2(z, r) + 0.5 * math.pi) / LEVEL).astype(np.int64)
     key = sector * N_LEVELS + level
     # In a ring near to far, where the upper ground and the lower have both returns of it.
     order = np.lexsort((r, key))
     kept = kept[order]
     n_standing = np.concatenate([[0], np.cumsum(stands[kept])])
-    sorted_xyz = np.stack([x[order], y[order], z[order]])
-    return _Returns(key[order], sector[order], sorted_xyz, r[order], is_ground[kept], n_standing)
+    places, r, z = np.stack([x, y, z])[:, order], r[order], z[order]
+    ground = is_ground[kept]
+    return _Returns(key[order], sector[order], places, r, ground, n_standing, z, -z / r)
 
 
 def _falls(returns: _Returns, least: float) -> tuple[IntArray, FloatArray]:
