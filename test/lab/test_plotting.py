@@ -191,15 +191,6 @@ def test_command_draws_a_scan_and_its_errors(scan, tmp_path, capsys):
     assert where(path, COLOURS['missed ground'])[1] > 10
 
 
-def test_colours_end_at_the_limits_and_nan_is_grey():
-    values = np.array([1.0, 50.0, 0.01, 500.0, np.inf, -np.inf, np.nan])
-    ends = plotting.ramp_colours(values, 1.0, 50.0)
-    np.testing.assert_array_equal(ends[2], ends[0])
-    np.testing.assert_array_equal(ends[3], ends[1])
-    assert not np.array_equal(ends[0], ends[1])
-    np.testing.assert_array_equal(ends[4:], [plotting.UNKNOWN] * 3)
-
-
 # Segments from the side.
 
 

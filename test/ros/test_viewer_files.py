@@ -11,7 +11,7 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.data.costmap import SegmentedCloud
-from gp_ground_seg.lab.plotting import COLOURS, HEIGHTS
+from gp_ground_seg.lab.plotting import COLOURS
 
 NODE = '/ground_segmentation_node'
 KINDS = {'scan': 'LaserScan', 'occupancy': 'Map'}
@@ -73,9 +73,9 @@ def test_colours_are_those_of_the_pictures():
         assert [*map(int, shown['Color'].split(';'))] == [*bytes.fromhex(COLOURS[name][1:])]
         assert PANEL[topic]['flatColor'] == f'{COLOURS[name].lower()}ff'
     (heights,) = (one for one in DISPLAYS if one.get('Channel Name') == 'height')
-    assert (heights['Min Intensity'], heights['Max Intensity']) == HEIGHTS
+    assert (heights['Min Intensity'], heights['Max Intensity']) == (-0.5, 3.0)
     labeled = PANEL[f'{NODE}/labeled']
-    assert (labeled['minValue'], labeled['maxValue']) == HEIGHTS
+    assert (labeled['minValue'], labeled['maxValue']) == (-0.5, 3.0)
 
 
 def snippets(page):
