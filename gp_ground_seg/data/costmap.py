@@ -96,13 +96,8 @@ class SegmentedCloud:
     @cached_property
     def blocked(self) -> Places:
         """Places of the obstacles, and of edges of drops if ``output.max_step_down`` is not 0."""
-        obstacles, edges = self.places(self.is_obstacle), self.edges
-        if len(edges) == 0:
-            return obstacles
-        x, y = (
-            np.concatenate([a, b.astype(a.dtype)])
-            for a, b in zip(obstacles, self._in_plane(*edges.T), strict=True)
-        )
+        both = zip(self.places(self.is_obstacle), self._in_plane(*self.edges.T), strict=True)
+        x, y = (np.concatenate([a, b.astype(a.dtype)]) for a, b in both)
         return x, y
 
     @cached_property
