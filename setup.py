@@ -10,10 +10,10 @@ PACKAGE = 'gp_ground_seg'
 README = Path(__file__).resolve().with_name('README.md')
 
 BAGS = ['mcap>=1.5', 'rosbags>=0.11.9']
-EVALUATE = ['pandas>=2.1']
+EVALUATE = ['pandas>=2.1', 'tabulate>=0.9']  # tables, and these as Markdown
 FORMATS = ['python-neo-lzf>=0.3']
 PLOT = ['matplotlib>=3.6']
-SCALE = ['distributed>=2025.1']  # 21 MB
+SCALE = ['cryptography>=42', 'distributed>=2025.1']
 VISER = ['viser>=1.1']
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
 ROS = [
@@ -31,7 +31,6 @@ DEV = [
     *FORMATS,
     *SCALE,
     *VISER,
-    'cryptography>=42',  # keys of a Dask cluster under test
     'codespell[toml]>=2.3',
     'import-linter>=2.10',
     'colcon-common-extensions',

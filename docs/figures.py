@@ -138,8 +138,11 @@ def kept(figure: Figure, output: str) -> str:
 def trimmed(table: str, dropped: Sequence[str] = (), wanted: str = '') -> str:
     """Return a table without some columns and rows, and without those that have no number."""
     above, lines = table.splitlines()[:2], table.splitlines()[2:]
-    lines = [line for line in lines if re.search(wanted, line)]
-    titles, rule, *rows = (line[2:-2].split(' | ') for line in (*above, *lines))
+    # pandas pads the cells; a page has them one blank apart.
+    cells = [[cell.strip() for cell in line.split('|')[1:-1]] for line in (*above, *lines)]
+    titles, marks, *rows = cells
+    rows = [row for row in rows if re.search(wanted, f'| {" | ".join(row)} |')]
+    rule = ['--:' if mark.endswith(':') else '---' for mark in marks]
     numbers = [k for k, mark in enumerate(rule) if mark.endswith(':')]
     rows = [row for row in rows if '-' not in row or {row[k] for k in numbers} - {'-', '0'}]
     empty = {k for k in numbers if all(row[k] == '-' for row in rows)}

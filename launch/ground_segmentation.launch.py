@@ -12,13 +12,7 @@ from ament_index_python.packages import (
     get_package_share_directory,
 )
 from launch import LaunchDescription
-from launch.actions import (
-    DeclareLaunchArgument,
-    LogInfo,
-    OpaqueFunction,
-    Shutdown,
-    TimerAction,
-)
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutdown, TimerAction
 from launch_ros.actions import Node
 
 SHARE = Path(get_package_share_directory('gp_ground_seg'))
@@ -32,12 +26,8 @@ ARGUMENTS = (
     ('params', '{}', "more parameters, as YAML: '{sensor.height: 1.2, learning.mode: fixed}'"),
     ('namespace', '', 'namespace of the node and of its outputs'),
     ('use_sim_time', 'false', 'use the time of /clock: true or false'),
-    ('rviz', 'false', 'start RViz beside it: true or false'),
-    (
-        'frame',
-        'velo_link',
-        'fixed frame of RViz: that of the clouds, or one that TF connects to it',
-    ),
+    ('rviz', 'false', 'start RViz too: true or false'),
+    ('frame', 'velo_link', 'fixed frame of RViz: that of the clouds, or one that TF knows'),
     ('log_level', 'info', 'level of the log of the node: debug, info, warn, error'),
     ('required', 'true', 'end the launch when the node ends: true or false'),
 )
@@ -52,7 +42,7 @@ def _boolean(values, name):
 
 
 def _parameters(values):
-    """Files and values for the node; of several values of a name the last one holds."""
+    """Files and values for the node; the last value of a name wins."""
     found = []
     if name := values['params_file']:
         preset = SHARE / 'config' / f'{name}.yaml'

@@ -102,7 +102,6 @@ def run_convert(arguments: argparse.Namespace) -> int:
     frames = list_frames(arguments.root, arguments.sequence, columns)
     stamps = [_nanoseconds(frame) for frame in frames]
     target = Path(arguments.output)
-    options.note_leftovers(target, quiet=arguments.quiet)
     n_points = 0
     with (
         BagWriter(target, force=arguments.force) as bag,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from collections import Counter
@@ -19,10 +18,10 @@ from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.core.errors import GroundSegError, in_thousands
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud
-from gp_ground_seg.data.files import staged_files
+from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.point_cloud2 import CloudMessage, read_fields, read_xyz
 from gp_ground_seg.lab.plotting import new_figure, plot_scan_view
-from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_labels, label_ratios
+from gp_ground_seg.lab.scoring.metrics import Labels, count_labels, label_ratios, true_labels
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_scan
 from gp_ground_seg.ros.node_process import GROUND, OBSTACLES, Link, NodeProcess, private_session
 from gp_ground_seg.ros.session import needing_ros
@@ -112,7 +111,7 @@ class Tally:
         parts = [np.full(cloud.width, LABELS[topic]) for topic, cloud in back.items()]
         self.label: Labels = np.concatenate(parts).astype(np.uint8)
         semantic = np.concatenate([read_fields(cloud)['label'] for cloud in back.values()])
-        self.truth = GROUNDGRID.truth(semantic, self.xyz[:, 2])
+        self.truth = true_labels(semantic)
         self.n_sent += int(np.isfinite(read_xyz(sent)).all(axis=1).sum())
         self.n_back += len(self.xyz)
         self.counts.update(count_labels(self.label, self.truth))
@@ -140,30 +139,25 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
     new_figure(1.0, 1.0)  # where it cannot draw, it says so before the drive
     n_frames, folder = arguments.frames, Path(arguments.output)
-    options.note_leftovers(folder)
-    with (
-        needing_ros('the demo'),
-        private_session('demo') as (session, words),
-        staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
-        NodeProcess(part / LOG, words) as node,
-    ):
-        _write(n_frames, part / BAG, session)
-        try:
-            with BagReader(part / BAG) as bag:
-                tally, (xyz, label, truth) = _play(bag, n_frames, session, node)
-        except GroundSegError as error:
-            print('the last lines of the log of the node:', *node.log_lines()[-LAST_LINES:],
-                  sep='\n  ', file=sys.stderr)  # fmt: skip
-            folder.mkdir(exist_ok=True)
-            for name in (BAG, LOG):
-                os.replace(part / name, folder / name)
-            raise GroundSegError(
-                f'{error}; {folder} has the bag and the log; try again with --force: what was '
-                'compiled is kept'
-            ) from error
+    with needing_ros('the demo'), private_session('demo') as (session, words):
+        folder.mkdir(exist_ok=True)
+        for name in (BAG, PICTURE, LOG):
+            check_writable(folder / name, force=arguments.force)
+        with NodeProcess(folder / LOG, words) as node:
+            _write(n_frames, folder / BAG, session)
+            try:
+                with BagReader(folder / BAG) as bag:
+                    tally, (xyz, label, truth) = _play(bag, n_frames, session, node)
+            except GroundSegError as error:
+                print('the last lines of the log of the node:', *node.log_lines()[-LAST_LINES:],
+                      sep='\n  ', file=sys.stderr)  # fmt: skip
+                raise GroundSegError(
+                    f'{error}; {folder} has the bag and the log; try again with --force: what was '
+                    'compiled is kept'
+                ) from error
         number = n_frames // 2 + 1
         title = f'Simulated street, scan {number} of {n_frames}'
-        counts = plot_scan_view(xyz, label, part / PICTURE, title, truth=truth)
+        counts = plot_scan_view(xyz, label, folder / PICTURE, title, truth=truth)
     print(f'\n{tally.summary()}\n')
     print(f'picture  {folder / PICTURE}  scan {number}: {counts}')
     print(f'bag      {folder / BAG}  what was played; `gp-ground-seg play` plays it again')
@@ -177,7 +171,7 @@ def _write(n_frames: int, path: Path, session: Session) -> None:
         f'[1/3] writing {scans} of a simulated street as a bag; meanwhile the node starts',
         flush=True,
     )
-    with options.progress('scans')(total=n_frames) as bar, BagWriter(path) as bag:
+    with options.progress('scans')(total=n_frames) as bar, BagWriter(path, force=True) as bag:
         bag.add_topic(TOPIC)
         for points, semantic, seconds in simulated_drive(n_frames):
             stamp = EPOCH * 10**9 + round(seconds * 1e9)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import ConfigError, DataError, shown
-from gp_ground_seg.core.parameters.config import Config, config_of
+from gp_ground_seg.core.errors import ConfigError, DataError, require, shown
+from gp_ground_seg.core.parameters.config import config_of
 from gp_ground_seg.data.inputs import Input, list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame, is_root, labelled_frames
+from gp_ground_seg.lab.cluster import Runner
 from gp_ground_seg.lab.scoring import report as results
 from gp_ground_seg.lab.scoring import tables
 from gp_ground_seg.lab.scoring.evaluate import (
@@ -24,19 +25,17 @@ from gp_ground_seg.lab.scoring.evaluate import (
     Scores,
     load_kitti,
     score_methods,
-    sums,
     title_of,
 )
-from gp_ground_seg.lab.scoring.metrics import label_ratios
 from gp_ground_seg.lab.scoring.objects import CUT_HEIGHT
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
 
 DESCRIPTION = """\
-Segment labelled frames and score the labels in both conventions of the field: precision,
-recall, F1, accuracy, IoU, time per frame. Count vehicles, persons and cyclists that are
-lost: the share of their returns from 0.3 m above the local ground that is labelled ground,
-and the objects with more than half of these returns labelled ground. Objects are the
-instances of the labels (their upper 16 bits). The last line is the result.
+Segment labelled frames and score the labels in the GroundGrid convention, which leaves
+vegetation out: precision, recall, F1, accuracy, IoU, time per frame. Count vehicles, persons
+and cyclists that are lost: the share of their returns from 0.3 m above the local ground that
+is labelled ground, and the objects with more than half of these returns labelled ground.
+Objects are the instances of the labels (their upper 16 bits). The last line is the result.
 
 Low things: the returns of vehicles, persons and cyclists more than --cut above the ground are
 taken out, and what is left, as low as a parcel, is segmented in a second run, which does not
@@ -44,7 +43,7 @@ count in the times. The share of the low returns that is labelled ground is repo
 cells: the share of the cells of 0.1 m of road, and of ground, in which a return of it is
 labelled obstacle, 0.15 m or more over the surface. Patchwork++ has no such heights.
 
-With --against another parameter file or preset, or with --peer Patchwork++, runs in turns on
+With --against a second set of parameters, or with --peer Patchwork++, runs in turns on
 the same frames. Each difference has a bootstrap interval over the sequences, or over blocks of
 frames of a single one; in a tie it holds 0. With --against ROOT may also be scans without
 labels, such as a folder or a bag: the tables have the points with two labels, and the time.
@@ -71,27 +70,25 @@ OF_FRAMES = (
     ('--frame-step', 'every Nth frame of a sequence only', options.NUMBER),
     options.COLUMNS,
 )
+CUT = (
+    '--cut',
+    f'height [m] at which objects are cut, to count low things (default: {CUT_HEIGHT}); '
+    '0 = no low things: each method segments a frame once',
+    {'metavar': 'HEIGHT', 'type': partial(options.above_zero, or_zero=True)},
+)
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
     parser = options.new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
+    peer = f'compare with this method: {PATCHWORKPP} (pip install pypatchworkpp)'
     options.add(
         parser,
         ROOT,
         *OF_FRAMES,
-        (
-            '--cut',
-            f'height [m] at which objects are cut, to count low things (default: {CUT_HEIGHT}); '
-            '0 = no low things: each method segments a frame once',
-            {'metavar': 'HEIGHT', 'type': partial(options.above_zero, or_zero=True)},
-        ),
+        CUT,
         ('--against', 'compare with this parameter file or preset', {'metavar': 'NAME'}),
-        (
-            '--peer',
-            f'compare with this method: {PATCHWORKPP} (pip install pypatchworkpp)',
-            {'type': options.one_of([PATCHWORKPP]), 'metavar': 'METHOD'},
-        ),
+        ('--peer', peer, {'choices': [PATCHWORKPP], 'metavar': 'METHOD'}),
         options.MARKDOWN,
         options.TO_JSON,
         options.FORCE,
@@ -104,58 +101,68 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate, write the files, print the tables."""
     config = options.read_config(arguments)
-    with options.staged_json(arguments) as path:
-        items, load = _items(arguments)
-        chosen: list[Method] = [OurMethod(config)]
-        changed: list[str] = []
-        if arguments.against is not None:
-            other, changed = _other_config(arguments, config)
-            chosen.append(OurMethod(other, shown(Path(arguments.against).name)))
-        elif arguments.peer is not None:
-            chosen.append(PatchworkppMethod.of_sensor(config.sensor))
-        with options.runner(arguments, 'evaluate') as runner:
-            scores = score_methods(items, chosen, load, runner=runner)
-        cut = _cut_of(arguments)
-        report = tables.evaluation(scores, config, runner.n_workers, cut)
+    cut = CUT_HEIGHT if arguments.cut is None else float(arguments.cut)
+    changed: list[str] = []
+    methods: list[Method] = [OurMethod(config)]
+    if arguments.against is not None:
+        other = config_of(arguments.against)
+        changed = options.changed_lines(other, config)
+        methods.append(OurMethod(other, shown(Path(arguments.against).name)))
+        if arguments.peer is not None:
+            raise ConfigError(
+                '--against: compares with parameters, --peer with a method; give one'
+            )
+        if not changed:
+            raise ConfigError(f'--against {arguments.against}: the same parameters as given')
+    elif arguments.peer is not None:
+        methods.append(PatchworkppMethod.of_sensor(config.sensor))
+
+    def measured(runner: Runner) -> results.Report:
+        items, load = _items(arguments, cut)
+        scores = score_methods(items, methods, load, runner=runner)
+        if changed:
+            print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
+        report = tables.evaluation(scores, config, runner.n_workers)
         report.facts.update(data=arguments.root, cut=cut)
-        environment = results.describe_environment(*(['pypatchworkpp'] if arguments.peer else []))
-        environment['n_workers'] = runner.n_workers
-        if path is not None:
-            report.write(path, environment)
-    if changed:
-        print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
-    lines = [results.parameters_line(report.facts['config_changes'])]
-    lines.append(results.machine_line(environment, report.backend))
-    print(results.written(report.tables.values(), lines, markdown=arguments.markdown))
-    if path is not None:
-        print(f'every number: {shown(arguments.json)}')
-    print('', *_result_lines(scores), sep='\n')
+        parameters = results.parameters_line(report.facts['config_changes'])
+        result[:] = [parameters, *_result_lines(scores)]
+        return report
+
+    result: list[str] = []
+    packages = ['pypatchworkpp'] if arguments.peer else []
+    print_report(arguments, 'evaluate', measured, packages)
+    print('', *result, sep='\n')
     return 0
 
 
-def _other_config(arguments: argparse.Namespace, config: Config) -> tuple[Config, list[str]]:
-    """Return the parameters of ``--against``, and how those given differ, which they must."""
-    if arguments.peer is not None:
-        raise ConfigError('--against: compares with parameters, --peer with a method; give one')
-    other = config_of(arguments.against)
-    changed = options.changed_lines(other, config)
-    if not changed:
-        raise ConfigError(f'--against {arguments.against}: the same parameters as given')
-    return other, changed
-
-
-def _cut_of(arguments: argparse.Namespace) -> float:
-    """Return the height at which objects are cut [m]."""
-    return CUT_HEIGHT if arguments.cut is None else float(arguments.cut)
-
-
-def _items(
+def print_report(
     arguments: argparse.Namespace,
-) -> tuple[Any, Callable[[Any], KnownScan]]:
+    title: str,
+    measured: Callable[[Runner], results.Report],
+    packages: Sequence[str],
+) -> None:
+    """Measure with the runner of the options, write ``--json``, and print the tables.
+
+    The versions of `packages` are recorded.
+    """
+    if arguments.markdown:
+        require('tabulate', 'tabulate')
+    with options.staged_json(arguments) as path:
+        with options.runner(arguments, title) as runner:
+            report = measured(runner)
+        environment = results.describe_environment(*packages)
+        environment['n_workers'] = runner.n_workers
+        if path is not None:
+            report.write(path, environment)
+    machine = results.machine_line(environment, report.backend)
+    print(report.text(machine, markdown=arguments.markdown))
+
+
+def _items(arguments: argparse.Namespace, cut: float) -> tuple[Any, Callable[[Any], KnownScan]]:
     """Return labelled frames, or with ``--against`` any clouds, and the reader of a cloud."""
     root = Path(arguments.root)
     if is_root(root):
-        return frames_from_options(arguments), partial(load_kitti, cut=_cut_of(arguments))
+        return frames_from_options(arguments), partial(load_kitti, cut=cut)
     if not root.exists():
         raise DataError(f'{root}: no such file or folder')
     if arguments.against is None:
@@ -173,27 +180,24 @@ def _items(
 
 def _load_cloud(sequence: str, item: Input) -> KnownScan:
     """Read a cloud without labels."""
-    return KnownScan(shown(sequence), shown(item.name), item.read().xyz, {})
+    return KnownScan(shown(sequence), shown(item.name), item.read().xyz)
 
 
 def _result_lines(scores: Scores) -> list[str]:
     """Return a line for each method on all its scans, ours the last."""
-    pooled, lines = sums(scores.scans), []
-    median = scores.scans.groupby('method')['seconds'].median()
+    pooled, lines = tables.measured(scores.scans), []
+    medians = scores.scans.groupby('method')['seconds'].median()
     for name in reversed(scores.methods):
         own = pooled.loc[name]
-        words = [] if scores.conventions else ['no labels of the ground']
-        for convention in scores.conventions[:1]:
-            ratios = label_ratios(own, f'{convention}_')
+        words = [] if scores.has_truth else ['no labels of the ground']
+        if scores.has_truth:
             titles = {'IoU': 'iou', 'precision': 'precision', 'recall': 'recall'}
-            words += [f'{title} {100.0 * ratios[key]:.2f} %' for title, key in titles.items()]
+            words += [f'{title} {100.0 * own[key]:.2f} %' for title, key in titles.items()]
         if own.get('n_objects'):
             words.append(f'{own["n_lost"]:.0f} of {own["n_objects"]:.0f} objects lost')
-        words.append(f'{1e3 * median[name]:.1f} ms')
-        lines.append(results.fold(f'{title_of(name)}: {", ".join(words)}'))
-    n_frames = pooled['n_scans'].iloc[0]
-    counted = f'{options.count(n_frames, "frame")} of '
-    counted += options.count(len(scores.sequences), 'sequence')
+        lines.append(f'{title_of(name)}: {", ".join(words)}, {1e3 * medians[name]:.1f} ms')
+    counted = options.count(int(pooled['n_scans'].iloc[0]), 'frame')
+    counted += f' of {options.count(len(scores.sequences), "sequence")}'
     return [f'{counted}; GroundGrid convention; median time of a frame', *lines]
 
 

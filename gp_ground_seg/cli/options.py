@@ -30,7 +30,7 @@ from gp_ground_seg.core.parameters.schema import (
     yaml_scalar,
 )
 from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, MIN_COLUMNS
-from gp_ground_seg.data.files import leftovers, staged_file
+from gp_ground_seg.data.files import staged_file
 from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.lab.cluster import Runner, open_runner
 
@@ -252,12 +252,6 @@ def staged_json(arguments: argparse.Namespace) -> AbstractContextManager[Path | 
     if arguments.json is None:
         return nullcontext()
     return staged_file(arguments.json, force=arguments.force)
-
-
-def note_leftovers(target: Path, *, quiet: bool = False) -> None:
-    """Name unfinished output that earlier runs left beside `target`."""
-    for path in [] if quiet else leftovers(target):
-        note(f'{path} is the unfinished output of another run; delete it if that one was killed')
 
 
 def count(number: int, noun: str) -> str:

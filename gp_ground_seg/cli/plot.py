@@ -22,7 +22,7 @@ from gp_ground_seg.lab.plotting import (
     plot_segment,
     segment_at,
 )
-from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
+from gp_ground_seg.lab.scoring.metrics import true_labels
 
 SCAN = """\
 Draw a scan in perspective: ground grey, obstacles orange; with --labels missed ground blue and
@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
     scan = options.list_clouds(arguments)[arguments.frame]
     points, title, truth = scan.read().xyz, shown(scan.title), None
     if arguments.labels is not None:
-        truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
+        truth = true_labels(read_labels(arguments.labels, len(points)))
     used = options.spare_compiling(config, 1)
     result = GroundSegmenter(used).segment(points)
     if arguments.picture == 'scan':

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import os
 import statistics
 from contextlib import closing
-from functools import partial
+from functools import partial, reduce
 from operator import attrgetter
 from pathlib import Path
 
@@ -16,18 +17,16 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.cloud_files import FORMATS, LABELS, format_for, read_file
-from gp_ground_seg.data.files import check_writable, flush, writing
+from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
 from gp_ground_seg.data.semantic_kitti import is_root, list_frames, list_sequences
-from gp_ground_seg.lab.cluster import cut
 from gp_ground_seg.lab.dataset import (
     PARAMETERS,
     Item,
     Outcome,
-    Record,
+    OutputFolder,
     count_clouds,
     segment_block,
-    sweep,
     write_bag,
     write_scans,
 )
@@ -44,8 +43,7 @@ Other scans keep their format and get label (1 ground, 2 obstacle, 0 no return),
 ground_z, ground_std and p_ground. A bag gives a rosbag2 of the ground and the obstacles of each
 cloud.
 
-Begun again with the same words it goes on: what is written already, from inputs that have not
-changed since, is left out.
+Begun again with the same words it goes on: an input is left out if its output is newer.
 
 At the end it prints height and tilt of the sensor, to check or to set (docs/pose.md).
 """
@@ -137,13 +135,10 @@ def _segment_to(target: Path, item: Item, arguments: argparse.Namespace, config:
         raise DataError(f'{target}: is the input; name another output')
     if target.suffix[1:] in FORMATS:
         check_writable(target, force=arguments.force)
-    options.note_leftovers(target, quiet=arguments.quiet)
     bar = options.progress('segment', quiet=arguments.quiet)
     used = options.spare_compiling(config, item.n_clouds)
     results = item.write(GroundSegmenter(used), target.parent)
     outcome = Outcome.of(bar(results, total=item.n_clouds))
-    with writing(target):
-        flush(target.parent)
     _print_summary(outcome, target)
     if not arguments.quiet:
         options.note_spared(config, used)
@@ -157,7 +152,7 @@ def _segment_into(
         raise DataError(f'{folder}: must be a folder')
     if not folder.resolve().parent.is_dir():
         raise DataError(f'{folder}: the folder {folder.resolve().parent} does not exist')
-    title = f'written by gp-ground-seg segment {__version__}'
+    title = f'written by gp-ground-seg segment {__version__}, from {_source(arguments)}'
     for name in 'topic', 'columns':
         title += f', {name} {value}' if (value := vars(arguments)[name]) else ''
     force, begun = arguments.force, folder / PARAMETERS
@@ -166,25 +161,30 @@ def _segment_into(
         used = config.replace(**{'runtime.backend': Config.from_yaml(begun).runtime.backend})
     else:
         used = options.spare_compiling(config, count_clouds(items))
-    with closing(Record(folder, used.to_yaml(title))) as record:
-        left = record.find_left(items, force=force)
+    # A bag takes long: each is a block by itself, and kept once it is finished.
+    group = attrgetter('path') if arguments.more else None
+    compute = partial(segment_block, folder, used)
+    with closing(OutputFolder(folder, f'# {shown(title)}\n{used.to_yaml()}')) as output:
+        left = output.find_left(items, force=force)
         if len(left) < len(items):
             print(f'{len(items) - len(left)} of {len(items)} were finished before')
-        if left:
-            with options.runner(arguments, 'segment') as runner:
-                record.begin(left, force=force)
-                # A bag takes long: each is a block by itself, and kept once it is finished.
-                group = attrgetter('path') if arguments.more else None
-                blocks, found = cut(left, group, runner.n_workers), Outcome.of([])
-                compute = partial(segment_block, folder, used)
-                outcomes = runner.map(compute, blocks, count_clouds)
-                for block, outcome in zip(blocks, outcomes, strict=True):
-                    record.add(block, outcome.written)
-                    found = found.joined(outcome)
-            _print_summary(found, folder, runner.n_workers)
-            if not arguments.quiet:
-                options.note_spared(config, used)
-        sweep(folder, items)
+        if not left:
+            return
+        with options.runner(arguments, 'segment') as runner:
+            output.begin(force=force)
+            outcomes = runner.run(compute, left, group, count_clouds)
+    _print_summary(reduce(Outcome.joined, outcomes), folder, runner.n_workers)
+    if not arguments.quiet:
+        options.note_spared(config, used)
+
+
+def _source(arguments: argparse.Namespace) -> Path:
+    """Return where the inputs are: the same names from elsewhere are other inputs."""
+    source = Path(arguments.input).resolve()
+    if arguments.more:
+        parents = [str(Path(path).resolve().parent) for path in (source, *arguments.more)]
+        return Path(os.path.commonpath(parents))
+    return source if holds_bag(source) or source.is_dir() else source.parent
 
 
 def _list_root(arguments: argparse.Namespace) -> list[Item]:
@@ -212,7 +212,7 @@ def _list_bags(arguments: argparse.Namespace) -> list[Item]:
     for name in names:
         if names.count(name) > 1:
             raise DataError(f'two of the bags would become {name}')
-    # The record of the folder knows what may be replaced.
+    # What may be replaced is known by `OutputFolder`.
     pairs = zip(paths, names, strict=True)
     return [_bag_item(path, name, arguments, force=True) for path, name in pairs]
 

@@ -7,15 +7,14 @@ it is in, before it counts as written: a power failure leaves no empty file unde
 from __future__ import annotations
 
 import errno
+import fcntl
 import glob
 import os
+import shutil
 import sqlite3
-import stat
 import tempfile
-import uuid
-import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -23,7 +22,8 @@ from gp_ground_seg.core.errors import DataError, reason_of
 from gp_ground_seg.data.bag_files import is_bag_folder
 
 MAX_SCAN_BYTES = 1 << 30  # of a file: 67 million points, a hundred times a dense scan
-PARTIAL_MARK = '.partial-'  # part of the hidden names under which unfinished output is kept
+PARTIAL_MARK = '.partial-'  # part of the names of hidden folders with unfinished output
+_REPLACED = 'replaced'  # name that a bag has there until the one that replaces it is in its place
 
 
 def read_bytes(path: str | Path, most: int, expected: str = '') -> bytes:
@@ -41,27 +41,12 @@ def read_bytes(path: str | Path, most: int, expected: str = '') -> bytes:
     return data
 
 
-def stamp(path: Path) -> tuple[int, str]:
-    """Size [bytes] and time of the last change of a file; of a folder, of all that is in it.
-
-    What is not there has the size -1.
-    """
+def changed_at(path: Path) -> int:
+    """Time of the last change of a file, or of any file in a folder [ns]; 0 if it is not there."""
     try:
-        parts = [part.stat() for part in (path, *path.rglob('*'))]
+        return max(part.stat().st_mtime_ns for part in (path, *path.rglob('*')))
     except FileNotFoundError:
-        return -1, ''
-    files = [part for part in parts if not stat.S_ISDIR(part.st_mode)]
-    return sum(f.st_size for f in files), str(max(part.st_mtime_ns for part in parts))
-
-
-def checksum(path: Path) -> str:
-    """CRC-32 of a file; of a folder, of the files in it, in the order of their names."""
-    crc = 0
-    for part in sorted(path.rglob('*')) if path.is_dir() else [path]:
-        with open(part, 'rb') as file:
-            while data := file.read(1 << 20):
-                crc = zlib.crc32(data, crc)
-    return f'{crc:08x}'
+        return 0
 
 
 @contextmanager
@@ -73,130 +58,86 @@ def writing(path: str | Path) -> Iterator[None]:
         raise DataError(f'{path}: cannot be written: {reason_of(error)}') from error
 
 
-def flush(path: Path) -> None:
-    """Have the disk hold a file, or the names in a folder, where its file system can."""
+@contextmanager
+def _opened(path: str | Path) -> Iterator[int]:
+    """Open a file or folder to read it; yield its number."""
     number = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(number)
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
-            raise OSError(error.errno, error.strerror, str(path)) from error
+        yield number
     finally:
         os.close(number)
 
 
-def write_file(path: Path, data: bytes) -> None:
-    """Write a file that appears, or is replaced, as a whole; DataError if it cannot be.
+def flush(path: Path) -> None:
+    """Have the disk hold a file, or the names in a folder, where its file system can."""
+    with _opened(path) as number:
+        try:
+            os.fsync(number)
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+                raise OSError(error.errno, error.strerror, str(path)) from error
 
-    Its folder is not flushed yet.
+
+def remove_leftovers(folder: Path, name: str = '') -> None:
+    """Remove unfinished output that killed runs left in a folder: of one target, or of all.
+
+    Output of runs that are still going is locked, and stays.
+    """
+    for left in folder.glob(f'.{glob.escape(name) or "*"}{PARTIAL_MARK}*'):
+        with suppress(OSError), _opened(left) as number:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            target = folder / left.name[1:].rpartition(PARTIAL_MARK)[0]
+            if not target.exists() and (left / _REPLACED).exists():
+                os.rename(left / _REPLACED, target)
+            shutil.rmtree(left)
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write a file, and the folders that it is in, as `staged_file` does; it replaces another.
+
+    What killed runs left of it stays: a folder of many files is searched once, by its writer.
     """
     with writing(path):
-        # Two workers that compute the same file write under different names.
-        partial = path.with_name(f'.{path.name}{PARTIAL_MARK}{uuid.uuid4().hex}')
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with open(partial, 'wb') as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+    with _staged(path, force=True) as part, writing(path):
+        part.write_bytes(data)
 
 
-def leftovers(target: str | Path) -> list[Path]:
-    """Unfinished output of other runs for the same target: killed ones, or still going."""
-    path = Path(target).resolve()
-    return sorted(path.parent.glob(f'.{glob.escape(path.name)}{PARTIAL_MARK}*'))
+@contextmanager
+def staged_file(
+    target: str | Path, *, force: bool, is_kind: Callable[[Path], bool] = Path.is_file
+) -> Iterator[Path]:
+    """Yield a path to write; at the end of the block the file is renamed to `target`.
 
-
-def staged_file(target: str | Path, *, force: bool) -> AbstractContextManager[Path]:
-    """Return a path to write, for a ``with`` block; at its end the file is renamed to `target`.
-
-    The block raises DataError if the target exists and `force` is false, is not a regular file,
-    or cannot be written.
+    Raises DataError if the target exists and `force` is false, is not of the kind that may be
+    replaced, or cannot be written. A block that writes nothing changes nothing.
     """
-    return _staged(target, partial(_check_file, target, force), os.replace)
-
-
-def check_writable(target: str | Path, *, force: bool) -> None:
-    """Raise what `staged_file` would, for a file that is written later; write nothing."""
-    with _staged(target, partial(_check_file, target, force), lambda _product, _path: None):
-        pass
+    path = Path(target).resolve()
+    remove_leftovers(path.parent, path.name)
+    with _staged(target, force=force, is_kind=is_kind) as product:
+        yield product
 
 
 def staged_bag_folder(target: str | Path, *, force: bool) -> AbstractContextManager[Path]:
     """Return the path of a folder to create, as `staged_file`; `force` replaces a rosbag2 only."""
-
-    def check(path: Path) -> None:
-        _refuse_existing(path, target, force)
-        if path.exists() and not is_bag_folder(path):
-            raise DataError(f'{target}: is not a rosbag2 folder, not replaced; remove it yourself')
-
-    def place(product: Path, path: Path) -> None:
-        # A folder cannot be replaced in one step: the old one is renamed, and back if need be.
-        aside = product.with_name('replaced')
-        try:
-            if path.exists():
-                os.rename(path, aside)
-            os.rename(product, path)
-        except BaseException:  # also that of Ctrl-C
-            if aside.exists() and not path.exists():
-                os.rename(aside, path)
-            raise
-
-    return _staged(target, check, place)
+    return staged_file(target, force=force, is_kind=is_bag_folder)
 
 
-@contextmanager
-def staged_files(folder: str | Path, names: Sequence[str], *, force: bool) -> Iterator[Path]:
-    """Yield a folder to write the files `names` into; all appear in `folder` at the end.
-
-    A folder that does not exist yet appears at once; into an existing one the
-    files are moved one by one, each complete, beside the files that are there. Until then they
-    are in a hidden folder, the parent of the yielded one. Raises DataError if one of the files
-    exists and `force` is false, or they cannot be written.
-    """
-
-    def check(path: Path) -> None:
-        if path.exists() and not path.is_dir():
-            raise DataError(f'{folder}: is a file, must be a folder')
-        existing = [name for name in names if (path / name).exists()]
-        if existing and not force:
-            raise DataError(
-                f'{Path(folder) / existing[0]}: exists already ({len(existing)} of {len(names)} '
-                'files to write do); --force replaces them'
-            )
-
-    def place(product: Path, path: Path) -> None:
-        if not path.exists():
-            os.rename(product, path)
-            return
-        for name in names:
-            os.replace(product / name, path / name)
-
-    with _staged(folder, check, place) as product:
-        product.mkdir()
-        yield product
-
-
-def _check_file(target: str | Path, force: bool, path: Path) -> None:
-    if path.exists() and not path.is_file():
-        raise DataError(f'{target}: is not a file, not replaced')
-    _refuse_existing(path, target, force)
-
-
-def _refuse_existing(path: Path, shown: str | Path, force: bool) -> None:
-    if path.exists() and not force:
-        raise DataError(f'{shown}: exists already; --force replaces it')
+def check_writable(target: str | Path, *, force: bool) -> None:
+    """Raise what `staged_file` would, for a file that is written later."""
+    with staged_file(target, force=force):
+        pass
 
 
 @contextmanager
 def _staged(
-    target: str | Path, check: Callable[[Path], None], place: Callable[[Path, Path], None]
+    target: str | Path, *, force: bool, is_kind: Callable[[Path], bool] = Path.is_file
 ) -> Iterator[Path]:
-    """Path with the final name, in a hidden folder beside it that goes away in the end."""
-    path = Path(target).resolve()
+    """Path with the final name, in a hidden folder beside it that goes away in the end.
+
+    The folder is locked. One of a run that was killed is not: the next run removes it.
+    """
+    path, check = Path(target).resolve(), partial(_check, target, force, is_kind)
     if path.is_symlink():
         raise DataError(f'{target}: {os.strerror(errno.ELOOP)}')
     check(path)
@@ -204,17 +145,18 @@ def _staged(
         raise DataError(f'{target}: the folder {path.parent} does not exist')
     hidden = path.with_name(f'.{path.name}{PARTIAL_MARK}')
     try:
-        with tempfile.TemporaryDirectory(
+        temporary = tempfile.TemporaryDirectory(
             prefix=hidden.name, dir=path.parent, ignore_cleanup_errors=True
-        ) as folder:
+        )
+        with temporary as folder, _opened(folder) as number:
+            with suppress(OSError):  # not every file system has locks
+                fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
             product = Path(folder, path.name)
             yield product
             check(path)
-            with writing(target):
-                for part in (*product.rglob('*'), product) if product.exists() else ():
-                    flush(part)
-                place(product, path)
-                flush(path.parent)
+            if product.exists():
+                with writing(target):
+                    _place(product, path)
     except OSError as error:
         if not str(error.filename).startswith(str(hidden)):
             raise  # of something else in the block
@@ -223,3 +165,29 @@ def _staged(
         if str(hidden) not in str(error):
             raise
         raise DataError(str(error).replace(str(product), str(target))) from error
+
+
+def _check(target: str | Path, force: bool, is_kind: Callable[[Path], bool], path: Path) -> None:
+    """Raise DataError if what is there may not be replaced."""
+    if path.exists() and not is_kind(path):
+        kind = 'rosbag2 folder' if is_kind is is_bag_folder else 'file'
+        raise DataError(f'{target}: is not a {kind}, not replaced; remove it yourself')
+    if path.exists() and not force:
+        raise DataError(f'{target}: exists already; --force replaces it')
+
+
+def _place(product: Path, path: Path) -> None:
+    """Flush a file or folder to disk, and give it its name."""
+    for part in (*product.rglob('*'), product):
+        flush(part)
+    # A folder cannot be replaced in one step: the old one is renamed, and back if need be.
+    aside = product.with_name(_REPLACED)
+    try:
+        if path.is_dir():
+            os.rename(path, aside)
+        os.rename(product, path)
+    except BaseException:  # also that of Ctrl-C
+        if aside.exists() and not path.exists():
+            os.rename(aside, path)
+        raise
+    flush(path.parent)

@@ -1,11 +1,10 @@
-"""Blocks of items, computed here, in processes of this machine, or by a Dask cluster.
+"""Blocks of items, computed in this process or by Dask: on this machine, or on a cluster.
 
 The one module that imports distributed, an optional package.
 """
 
 from __future__ import annotations
 
-import asyncio
 import importlib.metadata
 import itertools
 import logging
@@ -13,20 +12,12 @@ import multiprocessing
 import os
 import platform
 import signal
-import threading
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from concurrent.futures import (
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-)
-from contextlib import AbstractContextManager, contextmanager, suppress
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from multiprocessing import resource_tracker
-from queue import SimpleQueue
 from typing import Any
 
 from tqdm import tqdm
@@ -36,10 +27,10 @@ from gp_ground_seg.core.errors import LOGGER, DataError, in_one_line, messages_p
 
 BLOCK_SIZE = 64
 """Items of a block, where there are enough for all workers: they share what a task costs."""
-MAX_RESTARTS = 3
-"""How often workers of this machine are started anew, if one of them dies."""
 CONNECT_TIMEOUT = 10
 """Time in which a scheduler must answer [s]."""
+PACKAGES = 'distributed cryptography'
+"""What both kinds of workers need, of PyPI."""
 
 _NO_BAR = partial(tqdm, disable=True)
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
@@ -56,81 +47,66 @@ class Runner:
     ----------
     bar : callable
         Makes the progress bar of a number of items, ``bar(total=n)``.
-    open_executor : callable, optional
-        Opens workers that compute the blocks, as a context.
+    client : distributed.Client, optional
+        Of the cluster that computes the blocks.
     n_workers : int
         How many there are; 0 in this process.
     """
 
     def __init__(
-        self,
-        bar: Callable[..., tqdm[Any]] = _NO_BAR,
-        open_executor: Callable[[], AbstractContextManager[Executor]] | None = None,
-        n_workers: int = 0,
+        self, bar: Callable[..., tqdm[Any]] = _NO_BAR, client: Any = None, n_workers: int = 0
     ) -> None:
-        self._bar, self._open_executor, self.n_workers = bar, open_executor, n_workers
+        self._bar, self._client, self.n_workers = bar, client, n_workers
 
     def run(
         self,
         function: Function,
         items: Sequence[Any],
         group: Callable[[Any], Hashable] | None = None,
+        size_of: Callable[[Sequence[Any]], int] = len,
     ) -> list[Any]:
         """Return what `function` makes of each block of the items, in their order.
 
-        In this process they are one block; else `group` is as in `cut`.
+        In this process they are one block; else `group` is as in `cut`. The bar counts `size_of`
+        of each block. A block whose worker dies is computed again. Raises what `function` raises,
+        and DataError if every worker that computes a block dies, or the scheduler is lost.
         """
-        is_here = self._open_executor is None
-        return [*self.map(function, [items] if is_here else cut(items, group, self.n_workers))]
-
-    def map(
-        self,
-        function: Function,
-        blocks: Sequence[Sequence[Any]],
-        size_of: Callable[[Sequence[Any]], int] = len,
-    ) -> Iterator[Any]:
-        """Yield what `function` makes of each block, in their order; the bar is of their sizes.
-
-        A block whose worker dies is computed again. Raises what `function` raises, and DataError
-        if workers die again and again.
-        """
-        with self._bar(total=sum(map(size_of, blocks))) as bar:
-            if self._open_executor is None:
-                for block in blocks:
-                    yield function(block, partial(_count, bar))
-                return
-            found, n_yielded = dict[int, Any](), 0
-            for k, result in self._compute(function, dict(enumerate(blocks))):
-                bar.update(size_of(blocks[k]))
+        with self._bar(total=size_of(items)) as bar:
+            if self._client is None:
+                return [function(items, partial(_count, bar))]
+            blocks = cut(items, group, self.n_workers)
+            found: list[Any] = [None] * len(blocks)
+            for k, result in self._compute(function, blocks):
                 found[k] = result
-                while n_yielded in found:
-                    yield found.pop(n_yielded)
-                    n_yielded += 1
+                bar.update(size_of(blocks[k]))
+        return found
 
     def _compute(
-        self, function: Function, left: dict[int, Sequence[Any]]
+        self, function: Function, blocks: Sequence[Sequence[Any]]
     ) -> Iterator[tuple[int, Any]]:
         """Yield the number and the result of each block when it is finished."""
-        assert self._open_executor is not None
-        said = set[str]()
-        for n_restarts in itertools.count():
-            with self._open_executor() as executor:
-                for k, (result, notes) in _completed(executor, function, left):
-                    del left[k]
-                    for level, line in notes:
-                        if line not in said:
-                            said.add(line)
-                            LOGGER.log(level, '%s', line)
-                    yield k, result
-            if not left:
-                return
-            if n_restarts == MAX_RESTARTS:
-                first = next(iter(left.values()))[0]
+        from distributed import KilledWorker, as_completed
+
+        compute, said = partial(_compute_block, _versions(), function), set[str]()
+        numbers = {
+            self._client.submit(compute, block, pure=False): k for k, block in enumerate(blocks)
+        }
+        for future in as_completed([*numbers], loop=self._client.loop):
+            k = numbers.pop(future)  # or the cluster would keep the result
+            try:
+                result, notes = future.result()
+            except CancelledError as error:
+                raise DataError('the scheduler is lost') from error
+            except KilledWorker as error:
                 raise DataError(
-                    f'workers died {n_restarts + 1} times, as where memory is short: fewer '
-                    f'--workers have more of it each; the first item that is left is {first}'
-                )
-            LOGGER.warning('a worker died; computed again: %d blocks', len(left))
+                    f'{blocks[k][0]} to {blocks[k][-1]}: each worker that computed this block '
+                    'died, as where memory is short: fewer workers have more of it each'
+                ) from error
+            for level, line in notes:
+                if line not in said:
+                    said.add(line)
+                    LOGGER.log(level, '%s', line)
+            yield k, result
 
 
 HERE = Runner()
@@ -141,64 +117,6 @@ def _count(bar: tqdm[Any], items: Iterable[Any]) -> Iterator[Any]:
     for item in items:
         yield item
         bar.update()
-
-
-def _completed(
-    executor: Executor, function: Function, blocks: dict[int, Sequence[Any]]
-) -> Iterator[tuple[int, tuple[Any, _Notes]]]:
-    """Yield the number of each block and what `_compute_block` returns, when it is finished.
-
-    Those of processes that died are left out. Raises DataError if the cluster fails.
-    """
-    compute = partial(_compute_block, _versions(), function)
-    futures: dict[Future[tuple[Any, _Notes]], int] = {}
-    # Not `as_completed`: it locks all futures by turns, and where Ctrl-C comes between two of them
-    # they stay locked, so that the executor, which sets their results, never ends.
-    finished = SimpleQueue[Future[tuple[Any, _Notes]]]()
-    with _ctrl_c_kept(), suppress(BrokenExecutor):  # processes start here, and may die here
-        for k, block in blocks.items():
-            future = executor.submit(compute, block)
-            futures[future] = k
-            future.add_done_callback(finished.put)
-    while futures:
-        future = finished.get()
-        k = futures.pop(future)  # or the cluster would keep the result
-        try:
-            yield k, future.result()
-        except BrokenExecutor:
-            continue
-        except CancelledError as error:
-            raise DataError('the scheduler is lost') from error
-        except Exception as error:
-            if type(error).__name__ != 'KilledWorker':  # of distributed, which may be missing
-                raise
-            first, last = blocks[k][0], blocks[k][-1]
-            raise DataError(
-                f'{first} to {last}: each worker that computed this block died, as where memory '
-                'is short'
-            ) from error
-
-
-@contextmanager
-def _ctrl_c_kept() -> Iterator[None]:
-    """Keep Ctrl-C, which all processes of a terminal get, from those that are started.
-
-    They inherit the mask of signals. Here it takes effect when they are started.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    resource_tracker.ensure_running()  # its start would change the mask
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-        signal.signal(signal.SIGINT, before)
-        if came:
-            signal.raise_signal(signal.SIGINT)
 
 
 def cut(
@@ -262,84 +180,86 @@ def open_runner(
             n_workers = sum(client.nthreads().values())
             if not n_workers:
                 LOGGER.warning('the scheduler has no worker yet, waiting for one')
-            yield Runner(bar, partial(_tasks, client), n_workers)
+            yield Runner(bar, client, n_workers)
     elif workers is not None:
         most = 4 * (os.cpu_count() or 1)
         if workers > most:
             raise DataError(
                 f'--workers {workers}: must be 1 to {most} here, four for each processor'
             )
-        yield Runner(bar, partial(_processes, workers), workers)
+        with _start_workers(workers) as client:
+            yield Runner(bar, client, workers)
     else:
         yield Runner(bar)
 
 
-@contextmanager
-def _processes(n_workers: int) -> Iterator[Executor]:
-    """Start processes when there is work, and end them, at once if the block fails.
+def _quiet_distributed() -> Any:
+    """Import distributed; what it would log is said here in one line."""
+    distributed = require('distributed', PACKAGES)
+    for name in 'distributed', 'distributed.client':
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    return distributed
 
-    They are spawned: a fork of a process with threads, as of numba or BLAS, may hang.
+
+@contextmanager
+def _start_workers(n_workers: int) -> Iterator[Any]:
+    """Start a Dask cluster on this machine, which ends with the block."""
+    distributed, dask = _quiet_distributed(), require('dask', PACKAGES)
+    require('cryptography', PACKAGES)
+    others = multiprocessing.active_children()
+    with ExitStack() as stack:
+        # Without the pages that would show others on this machine what is computed.
+        pages = ('distributed.scheduler.http.routes', 'distributed.worker.http.routes')
+        stack.enter_context(dask.config.set(dict.fromkeys(pages, ())))
+        with _ctrl_c_kept():
+            cluster = distributed.LocalCluster(
+                n_workers=0,  # they start below: Ctrl-C does not wait for them
+                threads_per_worker=1,
+                memory_limit=None,
+                host='127.0.0.1',
+                security=distributed.Security.temporary(),
+                scheduler_kwargs={'dashboard': False, 'dashboard_address': '127.0.0.1:0'},
+                silence_logs=logging.CRITICAL,
+            )
+            stack.enter_context(cluster)
+            client = stack.enter_context(distributed.Client(cluster, set_as_default=False))
+        try:
+            cluster.scale(n_workers)
+            yield client
+        except BaseException:
+            # Without waiting for the blocks that are computed, and for workers that start.
+            for worker in cluster.workers.values():
+                worker.close_gracefully()  # or it would start the process anew
+            for process in multiprocessing.active_children():
+                if process not in others:
+                    process.kill()
+            raise
+
+
+@contextmanager
+def _ctrl_c_kept() -> Iterator[None]:
+    """Keep Ctrl-C, which all processes of a terminal get, from those of threads started here.
+
+    They inherit the mask of signals. In this process it takes effect behind the block.
     """
-    context, others = multiprocessing.get_context('spawn'), multiprocessing.active_children()
-    executor = ProcessPoolExecutor(n_workers, context, _end_with_parent)
+    resource_tracker.ensure_running()  # its start would change the mask
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        yield executor
-    except BaseException:
-        for process in multiprocessing.active_children():
-            if process not in others:
-                process.terminate()
-        raise
+        yield
     finally:
-        executor.shutdown(cancel_futures=True)
-
-
-def _end_with_parent() -> None:
-    """End this process when the one that started it ends, in whatever way."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def end() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=end, daemon=True).start()
-
-
-@contextmanager
-def _tasks(client: Any) -> Iterator[Executor]:
-    """Submit to a Dask cluster, and cancel what is left if the block fails."""
-    executor = client.get_executor(pure=False)
-    try:
-        yield executor
-    finally:
-        executor.shutdown(wait=False)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _connect(address: str) -> Any:
     """Connect to a scheduler, with the keys of Dask's configuration."""
     if not address.startswith(('tcp://', 'tls://')):
         raise DataError(f'--scheduler {address}: must be tcp://HOST:PORT, or tls://')
-    distributed = require('distributed', 'distributed')
-    for name in ('distributed', 'distributed.client'):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # said here in one line
+    distributed = _quiet_distributed()
     try:
-        # A client that cannot connect is left half made: it closes when it is collected, and where
-        # that falls into the start of the next one, both wait for one lock for ever.
-        asyncio.run(_greet(address))
         with warnings.catch_warnings():
             # Versions are compared by `_compute_block`, which says in one line what differs.
             warnings.simplefilter('ignore', distributed.versions.VersionMismatchWarning)
-            return distributed.Client(address, set_as_default=False)
+            return distributed.Client(address, set_as_default=False, timeout=CONNECT_TIMEOUT)
     except (OSError, ValueError, TypeError, MemoryError) as error:  # memory: no Dask speaks there
         text = f'--scheduler {address}: does not answer ({in_one_line(error)})'
         raise DataError(text) from error
-
-
-async def _greet(address: str) -> None:
-    """Connect to a scheduler with the keys of Dask's configuration, and hang up."""
-    from distributed import Security
-    from distributed.comm import connect
-
-    keys = Security().get_connection_args('client')
-    comm = await connect(address, timeout=CONNECT_TIMEOUT, **keys)
-    await comm.close()

@@ -37,7 +37,7 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.inputs import Input, Inputs
 from gp_ground_seg.data.semantic_kitti import read_entries
 from gp_ground_seg.lab.plotting import CAMERA, COLOURS, GREEN, TARGET
-from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_labels, label_ratios
+from gp_ground_seg.lab.scoring.metrics import Labels, count_labels, label_ratios, true_labels
 from gp_ground_seg.lab.scoring.objects import Objects, count_objects, labelled_objects
 
 Colours = npt.NDArray[np.uint8]
@@ -78,7 +78,7 @@ def read_view(item: Input, labels: str | None = None) -> View:
     if path is None:
         return View(points)
     entries = read_entries(path, len(points))
-    truth = GROUNDGRID.truth(entries & 0xFFFF, points[:, 2])
+    truth = true_labels(entries & 0xFFFF)
     objects = labelled_objects(points, entries, truth == Label.GROUND)
     return View(points, truth, objects)
 

@@ -50,8 +50,8 @@ class SequenceGaps:
 
     They were lost on the way, or overwritten in a full queue while the node was busy. rclpy does
     not say who has sent a message: a number counts as the next of the publisher whose last number
-    is the nearest below. Losses that this misses for a publisher are counted for another later.
-    The first message of a publisher may look like a gap, and is not counted.
+    is the nearest below. A loss of one publisher may so be counted later, for another one. The
+    first message of a publisher is not counted as a gap.
     """
 
     def __init__(self) -> None:
@@ -107,7 +107,7 @@ class CloudSubscription:
     """
 
     idle = ''
-    """Why no clouds are wanted, as of the last review."""
+    """Why no clouds are wanted, at the last review."""
     _subscription: Any = None
     _reliability = ReliabilityPolicy.UNKNOWN
     _fault_of_types = _fault_of_size = ''
@@ -147,7 +147,7 @@ class CloudSubscription:
 
     @property
     def n_publishers(self) -> int:
-        """Publishers, as of the last look."""
+        """Publishers at the last look."""
         return len(self._offered)
 
     @property
@@ -189,8 +189,8 @@ class CloudSubscription:
     def _check_size(self, size: int) -> None:
         if size > LARGE_CLOUD:
             self._fault_of_size = (
-                f'clouds of {size / 1e6:.1f} MB come best-effort, of which Fast DDS may lose '
-                'most: let their publisher offer reliable, or start it with '
+                f'clouds of {size / 1e6:.1f} MB come best-effort, and Fast DDS may lose most of '
+                'them: let their publisher offer reliable, or start it with '
                 'FASTRTPS_DEFAULT_PROFILES_FILE=config/fastdds_large_clouds.xml'
             )
             self._node.get_logger().warning(f'on {self.topic}, {self._fault_of_size}', once=True)

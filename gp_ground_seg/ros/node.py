@@ -45,13 +45,12 @@ from gp_ground_seg.ros.transforms import (
     CloudFrames,
     FrameListener,
     KeptPose,
+    check_tf2,
     is_listening,
-    is_tf_used,
-    require_tf2,
 )
 
-# From one heartbeat to the next [s], as of Nav2's own nodes: the manager connects after the first,
-# and waits half of its bond_timeout for one.
+# Time between heartbeats [s], the same as in Nav2's own nodes: the manager connects after the
+# first, and waits half of its bond_timeout for one.
 BOND_PERIOD = 0.1
 BOND_TIMEOUT = 4.0  # without one until the node is taken for dead [s]: the manager's own default
 BOND_DEPTH = 5
@@ -157,8 +156,7 @@ class GroundSegmentationNode(ConfiguredNode):
     def check_config(self, config: Config) -> None:
         """Raise a GroundSegError if the backend or TF is asked for and not installed."""
         choose_backend(config.runtime.backend)
-        if is_tf_used(config):
-            require_tf2(config)
+        check_tf2(config)
 
     def apply_config(self, config: Config) -> None:
         """Use `config` from the next cloud on; compiled code as soon as that is made."""
@@ -240,7 +238,7 @@ class GroundSegmentationNode(ConfiguredNode):
 
 
 class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[misc]
-    """A `GroundSegmentationNode` that is told when to begin, by the transitions of ROS.
+    """A `GroundSegmentationNode` that begins and ends with the transitions of ROS.
 
     *configure* makes the compiled backend and waits for it; *activate* subscribes, and begins the
     bond that Nav2's lifecycle manager waits for; *deactivate* ends both; *cleanup*, *shutdown* and
@@ -255,7 +253,7 @@ class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[m
         self._stop = stop
         GroundSegmentationNode.__init__(self, **options)
         LifecycleNodeMixin.__init__(self)
-        # Where a transition is impossible, rclpy's own callback raises, and nobody is answered.
+        # At an impossible transition rclpy's own callback raises, and the caller gets no answer.
         for service in self.services:
             if service.srv_type is ChangeState:
                 service.callback = partial(self._answer, service.callback)

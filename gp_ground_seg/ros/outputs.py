@@ -49,7 +49,7 @@ class Output(NamedTuple):
 
 
 def labelled_names(taken: Iterable[str]) -> dict[str, str]:
-    """Return the names of `LABELLED_FIELDS` beside those `taken`: ours get ``gp_`` in front."""
+    """Return a free name for each of `LABELLED_FIELDS`: with ``gp_`` where it is `taken`."""
     used, names = set(taken), {}
     for field in LABELLED_FIELDS:
         name = field

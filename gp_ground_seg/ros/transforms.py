@@ -27,8 +27,8 @@ from gp_ground_seg.ros.input import STEADY_CLOCK, OnCloud, seconds_of
 KEPT_JUMP = 1.0  # jump back up to which transforms are kept: a late stamp, no other run [s]
 MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]
 REVIEW_PERIOD = 0.005  # time between two looks at whether they have come [s]
-IMU_TOLERANCE = 0.05  # time between a cloud and the orientation that holds for it, at most [s]
-IMU_DEPTH = 400  # messages kept: those of the wait and of a cloud before, at 1 kHz
+IMU_TOLERANCE = 0.05  # longest time between a cloud and its orientation [s]
+IMU_DEPTH = 400  # messages kept: of the wait and of the previous cloud, at 1 kHz
 INSTALL_TF2 = 'sudo apt install ros-jazzy-tf2-ros-py'
 
 
@@ -40,17 +40,17 @@ def find_tf2() -> Any:
         return None
 
 
-def require_tf2(config: Config) -> Any:
-    """Return the module tf2_ros; raise a MissingDependencyError if it is not installed."""
+def check_tf2(config: Config) -> None:
+    """Raise a MissingDependencyError if `config` asks for TF and tf2_ros is not installed."""
+    if not is_tf_used(config) or find_tf2() is not None:
+        return
     asked, instead = 'frame.level = tf', 'frame.level = sensor with sensor.roll and sensor.pitch'
     if config.frame.sensor != NO_FRAME:
         asked = f'frame.sensor = {config.frame.sensor}'
         instead = 'frame.sensor = none with sensor.origin_x, origin_y and origin_z'
-    if (found := find_tf2()) is None:
-        raise MissingDependencyError(
-            f'{asked}: needs tf2_ros, which cannot be imported: {INSTALL_TF2}, or use {instead}'
-        )
-    return found
+    raise MissingDependencyError(
+        f'{asked}: needs tf2_ros, which cannot be imported: {INSTALL_TF2}, or use {instead}'
+    )
 
 
 def rotation_of(rotation: Quaternion) -> FloatArray:
@@ -91,7 +91,7 @@ def is_listening(config: Config) -> bool:
 
 
 class CloudFrames(NamedTuple):
-    """What is known of the frame of a cloud; None for what nobody has asked for."""
+    """What TF or an IMU say of the frame of a cloud; None for what the parameters do not ask."""
 
     tilt: tuple[float, float] | None = None  # roll and pitch of the sensor [rad]
     origin: tuple[float, float, float] | None = None  # place of the sensor in it [m]
@@ -155,7 +155,7 @@ class FrameListener:
     def __init__(self, node: Node, config: Config, use: OnCloud) -> None:
         self.config = config
         self._imu = ImuListener(node) if config.frame.level == 'imu' else None
-        self._tf2_ros = require_tf2(config) if is_tf_used(config) else find_tf2()
+        self._tf2_ros = find_tf2()
         if self._tf2_ros is not None:
             # Without the node: given one, the buffer clears itself at jumps of the node's clock,
             # and in some releases raises an error there that ends the executor. See `time_jumped`.

@@ -63,7 +63,7 @@ def test_a_folder_of_several_formats(tmp_path, expected, capsys):
     assert [one.name for one in list_inputs(folder)] == ['a.bin', 'a.npy', 'b']
     assert run('segment', folder, '-o', tmp_path / 'own', '--quiet') == 0
     own = sorted(path.name for path in (tmp_path / 'own').iterdir())
-    assert own == ['a.bin.label', 'a.npy.npy', 'b.label', 'outputs.jsonl', 'parameters.yaml']
+    assert own == ['a.bin.label', 'a.npy.npy', 'b.label', 'parameters.yaml']
     assert run('segment', folder, '-o', tmp_path / 'pcd', '--format', 'pcd') == 0
     for name in ('a.bin', 'a.npy', 'b'):
         found = read_file(tmp_path / 'pcd' / f'{name}.pcd').fields

@@ -13,7 +13,6 @@ import bag_samples as samples
 import numpy as np
 import pytest
 from cli_runner import error_line, run, start, wait_for
-from evaluation_samples import label_files
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.cli.segment import _pose_summary
@@ -206,17 +205,6 @@ def test_scans_give_label_files(segmenter, tmp_path, capsys, monkeypatch, scans,
     assert hidden(out.parent) == hidden(out) == []
 
 
-def test_labels_into_one_file_and_settings_are_used(segmenter, tmp_path):
-    scan = write_scans(tmp_path / 'velodyne') / '000000.bin'
-    words = ['-o', tmp_path / 'one.label']
-    assert segment(scan, *words) == 0
-    written = np.fromfile(tmp_path / 'one.label', dtype='<u4')
-    np.testing.assert_array_equal(written, expected_labels(segmenter, 0))
-    assert segment(scan, *words, '--force', '--set', 'label.ground_tolerance=0.001') == 0
-    narrow = np.fromfile(tmp_path / 'one.label', dtype='<u4')
-    assert np.count_nonzero(narrow == 40) < np.count_nonzero(written == 40)
-
-
 def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
     write_scans(tmp_path / 'velodyne', n_scans=2)
     out = tmp_path / 'labels'
@@ -232,9 +220,13 @@ def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
         expected = rf'000001\.label: exists already{share}.* --force replaces'
         assert re.search(expected, error_line(capsys))
     assert {path.name: path.read_text() for path in out.iterdir()} == mine
-    assert segment(tmp_path / 'velodyne', '-o', out, '--force') == 0
-    written = np.fromfile(out / '000001.label', dtype='<u4')
-    np.testing.assert_array_equal(written, expected_labels(segmenter, 1))
+    for source, target, k in (
+        ('velodyne/000000.bin', out / '000001.label', 0),
+        ('velodyne', out, 1),
+    ):
+        assert segment(tmp_path / source, '-o', target, '--force') == 0
+        written = np.fromfile(out / '000001.label', dtype='<u4')
+        np.testing.assert_array_equal(written, expected_labels(segmenter, k))
     assert (out / 'readme').read_text() == 'mine'
 
 
@@ -292,6 +284,7 @@ def content(folder):
         ('arrays -o arrays --force', 'is the input'),
         ('good/000000.bin -o x.label --workers 2', '--workers: is for several inputs'),
         ('short.bin -o new', 'short.bin: 10 bytes is not a whole number'),
+        ('short.bin -o empty', 'short.bin: 10 bytes is not a whole number'),
         ('a.npy -o a.npy --force', 'a.npy: is the input'),
         ('a.npy -o a.xyz', 'a.xyz: must be a folder, or end in .label, .pcd'),
         ('a.npy -o taken.pcd', 'taken.pcd: exists already'),
@@ -312,27 +305,6 @@ def test_refused_in_one_line_and_nothing_is_changed(inputs, capsys, monkeypatch,
     assert segment(*words.split()) == 2
     assert message in error_line(capsys)
     assert content(inputs) == before
-
-
-def test_a_run_that_writes_nothing_leaves_the_folders_of_the_user(tmp_path):
-    (tmp_path / 'a.bin').write_bytes(b'0123456789')
-    (tmp_path / 'mine/empty').mkdir(parents=True)
-    assert segment(tmp_path / 'a.bin', '-o', tmp_path / 'mine') == 2
-    assert (tmp_path / 'mine/empty').is_dir()
-
-
-def test_a_truncated_scan_late_in_a_folder_stops_and_the_rest_is_done_later(tmp_path, capsys):
-    folder, out = write_scans(tmp_path / 'velodyne', 4), tmp_path / 'velodyne_ground'
-    whole = (folder / '000003.bin').read_bytes()
-    (folder / '000003.bin').write_bytes(b'0123456789')
-    assert segment(folder) == 2
-    assert '000003.bin: 10 bytes is not a whole number' in error_line(capsys)
-    assert hidden(out) == [] and len(list(out.glob('*.label'))) == 3
-    (folder / '000003.bin').write_bytes(whole)
-    assert segment(folder) == 0
-    assert segment(folder, '-o', tmp_path / 'anew') == 0
-    assert label_files(out) == label_files(tmp_path / 'anew')
-    assert len(label_files(out)) == 4
 
 
 @pytest.mark.parametrize(('words', 'shown'), [([], True), (['--quiet'], False)])
@@ -370,7 +342,7 @@ def test_the_summary_has_height_and_tilt_of_the_sensor_and_what_they_contradict(
     assert contradiction.startswith('sensor.height = 2.5: the ground near the sensor is 1.2')
     assert contradiction.endswith('(1 frame: docs/pose.md)')
     tilts = [(0.0, 0.0), (0.1, -0.2), (0.1, -0.2)]
-    assert _pose_summary(Outcome(9, 3, 3 * [0.001], [1.2, 1.1, 1.3], tilts, [], {})) == (
+    assert _pose_summary(Outcome(9, 3, 3 * [0.001], [1.2, 1.1, 1.3], tilts, [])) == (
         'measured in 3 frames: sensor.height=1.20 (std 0.10) m, '
         'sensor.roll=0.100 (std 0.058) rad, sensor.pitch=-0.200 (std 0.115) rad'
     )
@@ -422,10 +394,8 @@ def test_a_stopped_run_leaves_the_old_bag(tmp_path, capsys, how, code):
     assert how == signal.SIGKILL or said == 'gp-ground-seg: interrupted\n'
     is_old = read_messages(tmp_path / 'out') == before  # pytest would compare them for hours
     assert is_old
-    left = hidden(tmp_path)
-    assert len(left) == (how == signal.SIGKILL)
-    # It is not in the way of the next run, which says that it is there.
+    assert len(hidden(tmp_path)) == (how == signal.SIGKILL)
+    # The next run for the same target removes it.
     samples.write_ros2_bag(tmp_path / 'short', 1)
     assert segment(tmp_path / 'short', '-o', tmp_path / 'out', '--force') == 0
-    said = capsys.readouterr().err
-    assert all(f'{name} is the unfinished output of another run' in said for name in left)
+    assert hidden(tmp_path) == []

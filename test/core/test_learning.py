@@ -1,5 +1,7 @@
 """Learning recovers what frames were drawn from, within budget and bounds."""
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 import reference_gp
@@ -9,13 +11,15 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.frame import Frame, Inliers
+from gp_ground_seg.core.gp import learning
 from gp_ground_seg.core.gp.learning import (
+    Learned,
     ThetaSpace,
     every_segment,
     given_theta,
-    maximise,
     theta_space,
 )
+from gp_ground_seg.core.gp.search import search_from
 from gp_ground_seg.core.jit import JIT_ENABLED
 from gp_ground_seg.core.parameters.config import PRESETS
 from gp_ground_seg.core.pipeline.lines import class_middles
@@ -57,17 +61,20 @@ def space_about(centre, free=None, factor=20.0):
 
 def learn(inliers, space, start, use_priors=True, max_evaluations=200):
     """Outcome, and the values of the objective without priors."""
-    values = []
+    values, theta, outcome = [], start.copy(), np.empty(2)
 
-    def objective(theta):
-        value, gradient = compiled_log_likelihood(theta, inliers, 0.0, not use_priors)
+    def set_likelihood(theta, *arguments):
+        value, arguments[-1][:] = compiled_log_likelihood(theta, *arguments[:-1])
         values.append(value)
-        return value, gradient
+        return value
 
-    how = {'use_priors': use_priors, 'max_evaluations': max_evaluations}
-    learned = maximise(objective, space, start, len(inliers.r), **how)
-    assert learned.n_evaluations == len(values)
-    return learned, values
+    search = search_from(theta, space.lower.copy(), space.upper.copy())
+    with patch.object(learning, 'set_likelihood', set_likelihood):
+        n = learning.maximise(
+            space, inliers, 0.0, use_priors, max_evaluations, search, theta, outcome
+        )
+    assert n == len(values)
+    return Learned.of(theta, float(outcome[0]), n, int(outcome[1]), space), values
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2])

@@ -24,7 +24,9 @@ from evaluation_samples import write_streets
 
 from gp_ground_seg.cli import tune
 from gp_ground_seg.core import jit
-from gp_ground_seg.data.bags import BagReader
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.data import files
+from gp_ground_seg.data.bags import BagReader, BagWriter
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -115,7 +117,7 @@ def content(folder):
                 found[name] = list(bag.messages())
         elif path.suffix == '.json':  # has times
             found[name] = sorted(json.loads(path.read_bytes()))
-        elif path.name not in ('outputs.jsonl', 'metadata.yaml', 'node.log'):
+        elif path.name != 'metadata.yaml':
             found[name] = path.read_bytes()
     return found
 
@@ -160,14 +162,10 @@ COMMANDS = {
 }
 
 
-WHOLE = 'metadata.yaml', 'drive.mcap'
-"""Files of which one tells that a folder is a whole output."""
-
-
 def words_of(line, folder, *more):
     """Words of a command that writes into a folder."""
     words = line.format(folder).split()
-    return [*words, *more, *(NUMPY if words[0] not in ('kitti-to-bag', 'demo') else [])]
+    return [*words, *more, *(NUMPY if words[0] != 'kitti-to-bag' else [])]
 
 
 @pytest.fixture
@@ -191,7 +189,7 @@ def errors_of(capsys):
 def assert_begun_again(line, folder, expected, where):
     """The same command, and `--force` where it has said that its output is there, is whole."""
     target = folder / line.split('{}/')[1]
-    is_there = target.is_file() or any((target / name).exists() for name in WHOLE)
+    is_there = target.is_file() or (target / 'metadata.yaml').exists()
     assert run(*words_of(line, folder, *['--force'] * is_there)) == 0, where
     assert content(folder) == {**expected, 'mine': MINE}, where
 
@@ -199,32 +197,14 @@ def assert_begun_again(line, folder, expected, where):
 @pytest.mark.usefixtures('at_inputs')
 @pytest.mark.parametrize('name', COMMANDS)
 def test_each_call_that_writes_fails_in_turn(name, tmp_path, capsys):
-    calls = fail_in_turn(COMMANDS[name], tmp_path, capsys)
-    assert {'write', 'fsync'} <= {*calls} and {'replace', 'rename'} & {*calls}
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_each_call_by_which_demo_writes_its_folder_fails_in_turn(tmp_path, capsys):
-    """Those of its bag and its picture are told by the commands above."""
-    pytest.importorskip('rclpy', reason='ROS is not installed')
-    line = 'demo --frames 2 --output {}/out'
-    calls = fail_in_turn(line, tmp_path, capsys, leave_out=('.drive.mcap', '.scan.png'))
-    assert {'mkdir', 'open', 'fsync'} <= {*calls} and {'replace', 'rename'} & {*calls}
-
-
-def fail_in_turn(line, tmp_path, capsys, leave_out=()):
-    """Run a command once for each of its calls but some, which fails; return the names of all."""
-    whole = tmp_path / 'whole'
+    line, whole = COMMANDS[name], tmp_path / 'whole'
     whole.mkdir()
     with Disk(whole).at_work() as disk:
         assert run(*words_of(line, whole)) == 0
-    calls, expected = [call for call, _ in disk.calls], content(whole)
+    names, expected = {call for call, _ in disk.calls}, content(whole)
+    assert {'write', 'fsync'} <= names and {'replace', 'rename'} & names
     cases = [
-        (k, fault)
-        for k, (call, place) in enumerate(disk.calls)
-        if not any(part in place for part in leave_out)
-        for fault in FAULTS.get(call, (FULL,))
+        (k, fault) for k, (call, _) in enumerate(disk.calls) for fault in FAULTS.get(call, (FULL,))
     ]
     for n, (k, fault) in enumerate(cases):
         folder = tmp_path / f'{n}'
@@ -251,7 +231,6 @@ def fail_in_turn(line, tmp_path, capsys, leave_out=()):
         assert all(found[path] in (expected.get(path), before.get(path)) for path in found), where
         if found != before:  # else it is as the first run
             assert_begun_again(line, folder, expected, where)
-    return calls
 
 
 @pytest.mark.usefixtures('at_inputs')
@@ -275,6 +254,36 @@ def test_a_disk_that_is_full_at_any_page_of_a_sqlite_bag(tmp_path, capsys):
         assert code == 2 and f'{folder}/out.db3: cannot be written: ' in said, size
         assert [path.name for path in folder.iterdir()] == ['mine']
         assert_begun_again(line, folder, expected, size)
+
+
+def test_the_next_run_removes_what_a_killed_one_left_of_its_target(tmp_path):
+    """Of a run that is still going nothing is removed."""
+    target = tmp_path / 'a [x]'
+    for name in ('a [x]', 'a x', 'mine'):
+        files.write_file(tmp_path / f'.{name}.partial-1/a', MINE)
+    with files.staged_file(target, force=True) as first:
+        first.write_bytes(b'1')
+        with files.staged_file(target, force=True) as second:
+            second.write_bytes(b'2')
+        assert (target.read_bytes(), first.read_bytes()) == (b'2', b'1')
+    assert target.read_bytes() == b'1'
+    names = {'.a x.partial-1', '.mine.partial-1', 'a [x]'}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    # It was killed while it replaced a bag.
+    (tmp_path / '.drive.partial-1').mkdir()
+    before = write_ros2_bag(tmp_path / '.drive.partial-1/replaced')
+    with pytest.raises(DataError, match='drive: exists already'):
+        BagWriter(tmp_path / 'drive').__enter__()
+    with BagReader(tmp_path / 'drive') as bag:
+        assert list(bag.messages()) == before
+    assert {path.name for path in tmp_path.iterdir()} == names | {'drive'}
+
+
+def test_a_folder_is_not_replaced_by_a_file(tmp_path):
+    (tmp_path / 'file').mkdir()
+    with pytest.raises(DataError, match='not replaced'):
+        files.write_file(tmp_path / 'file', b'')
+    assert [p.name for p in tmp_path.iterdir()] == ['file']
 
 
 DOUBLE = """

@@ -1,4 +1,4 @@
-"""Conventions, counts, ratios, rings, classes, probabilities, height errors: by loops and hand."""
+"""True labels, counts, ratios, rings, probabilities, height errors: by loops and by hand."""
 
 import itertools
 import math
@@ -12,30 +12,17 @@ from hypothesis import strategies as st
 from gp_ground_seg import Label
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.lab.scoring import metrics
-from gp_ground_seg.lab.scoring.metrics import COUNTS, GROUNDGRID, height_ratios, label_ratios
+from gp_ground_seg.lab.scoring.metrics import COUNTS, HEIGHT_MEASURES, label_ratios
 
 GROUND_NUMBERS = {40, 44, 48, 49, 60, 72}
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-@pytest.mark.parametrize('convention', metrics.CONVENTIONS, ids=lambda c: c.key)
-def test_ground_classes_are_ground_and_unlabelled_is_left_out(convention):
-    for number in {0, 1, 10, 16, 30, 50, 71, 80, 99, 252, 259, *GROUND_NUMBERS}:
+def test_ground_classes_are_ground_and_vegetation_is_left_out():
+    numbers = [0, 1, 10, 16, 30, 50, 70, 71, 77, 80, 99, 252, 259, 65535, *GROUND_NUMBERS]
+    for number, found in zip(numbers, metrics.true_labels(np.array(numbers)), strict=True):
         expected = Label.GROUND if number in GROUND_NUMBERS else Label.OBSTACLE
-        for z in (-5.0, -1.3, 0.0, 3.0):
-            (truth,) = convention.truth(np.array([number]), np.array([z]))
-            assert truth == (Label.UNKNOWN if number in (0, 1) else expected)
-
-
-def test_vegetation_by_convention_and_unknown_numbers():
-    z = np.array(
-        [np.nextafter(metrics.LOW_VEGETATION_Z, -9), metrics.LOW_VEGETATION_Z, -1.29, np.nan]
-    )
-    semantic = np.full(4, 70)
-    assert pytest.approx(-1.2975) == metrics.LOW_VEGETATION_Z
-    assert GROUNDGRID.truth(semantic, z).tolist() == [Label.UNKNOWN] * 4
-    assert metrics.PATCHWORK.truth(semantic, z).tolist() == [Label.GROUND] + [Label.OBSTACLE] * 3
-    assert GROUNDGRID.truth(np.array([77, 65535]), np.zeros(2)).tolist() == [Label.OBSTACLE] * 2
+        assert found == (Label.UNKNOWN if number in (0, 1, 70) else expected), number
 
 
 def test_ratios_by_hand():
@@ -49,8 +36,7 @@ def test_ratios_by_hand():
     assert math.isnan(only_obstacles['iou'])
     assert only_obstacles['accuracy'] == 1.0
     # Of a frame, row by row the same.
-    of_frame = label_ratios(pd.DataFrame(counts).add_prefix('a_'), 'a_')
-    for name, values in of_frame.items():
+    for name, values in label_ratios(pd.DataFrame(counts)).items():
         expected = [found[name], nothing[name], only_obstacles[name]]
         np.testing.assert_array_equal(values, expected)
 
@@ -137,8 +123,8 @@ def test_what_is_no_probability_is_refused(p):
 def test_height_error_of_nothing(n):
     sums = metrics.height_sums(np.ones(n), np.full(n, np.nan))
     assert (sums['n_points'], sums['n_without_model']) == (0, n)
-    found = height_ratios(sums)
-    assert set(found) == {'rmse', 'bias', 'smse', 'within_1', 'within_2'}
+    found = {name: measure(sums) for name, measure in HEIGHT_MEASURES.items()}
+    assert found.pop('without_model') == (1.0 if n else pytest.approx(math.nan, nan_ok=True))
     assert all(map(math.isnan, [*found.values(), sums['median_absolute']]))
 
 
@@ -154,11 +140,12 @@ def test_pooled_height_errors_are_those_of_all_points(seed, n, m):
         expected = np.nanmedian(np.abs(error[k]))
         assert part['median_absolute'] == pytest.approx(expected, rel=1e-9)
     sums = pd.DataFrame(found).sum()
-    pooled = height_ratios(sums)
+    pooled = {name: measure(sums) for name, measure in HEIGHT_MEASURES.items()}
     known = np.isfinite(error)
     e, s = error[known], std[known]
     assert (sums['n_points'], sums['n_without_model']) == (known.sum(), (~known).sum())
     assert pooled['rmse'] == pytest.approx(np.sqrt(np.mean(e**2)))
+    assert pooled['without_model'] == pytest.approx(np.mean(~known))
     assert pooled['bias'] == pytest.approx(e.mean())
     assert pooled['within_1'] == np.mean(np.abs(e) <= s)
     assert pooled['within_2'] == np.mean(np.abs(e) <= 2.0 * s)

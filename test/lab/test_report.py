@@ -4,93 +4,72 @@ import json
 import math
 import os
 import platform
-import shutil
 import subprocess
 
 import numpy as np
 import pandas as pd
-import pytest
 
 from gp_ground_seg import Config, __version__
 from gp_ground_seg.lab.scoring import report
-from gp_ground_seg.lab.scoring.report import Column, Table
+from gp_ground_seg.lab.scoring.report import Form, Report, Table
 
 TABLE = Table(
+    'Scores',
+    pd.DataFrame({
+        'name': ['00', '08', 'all'],
+        'points': [1234567.0, math.nan, 1234572.0],
+        'iou': [0.9876, math.nan, 0.5],
+        'peer_iou': [0.25, 2e-20, None],
+        'change': [-0.001, None, 0.25],
+    }),
     {
-        Column('sequence', key='name'): ['00', '08', 'all'],
-        Column('points', '_d'): np.array([1234567, 5, 1234572]),
-        Column('IoU [%]', '.2f', 'iou', 100.0): pd.Series([0.9876, math.nan, 0.5]),
-        Column('change [%]', '+.1f', 'change', 100.0): [-0.001, None, 0.25],
+        'name': Form('sequence'), 'points': Form('points', ',.0f'),
+        'iou': Form('IoU [%]', '.2f', 100.0), 'change': Form('change', '+.1f', [100.0, 1.0, 1.0]),
     },
-    title='Scores',
-    notes=['a note'],
-    n_sums=1,
-)
-FORMS = {
-    'text': (
-        'Scores\n'
-        'sequence     points  IoU [%]  change [%]\n'
-        '----------------------------------------\n'
-        '00        1 234 567    98.76        -0.1\n'
-        '08                5        -           -\n'
-        '----------------------------------------\n'
-        'all       1 234 572    50.00       +25.0\n'
-        '\n'
-        'a note'
-    ),
-    'markdown': (
-        'Scores\n\n'
-        '| sequence | points | IoU [%] | change [%] |\n'
-        '| --- | --: | --: | --: |\n'
-        '| 00 | 1 234 567 | 98.76 | -0.1 |\n'
-        '| 08 | 5 | - | - |\n'
-        '| all | 1 234 572 | 50.00 | +25.0 |\n\n'
-        'a note'
-    ),
-    'json': [
-        {'name': '00', 'points': 1234567, 'iou': 0.9876, 'change': -0.001},
-        {'name': '08', 'points': 5, 'iou': None, 'change': None},
-        {'name': 'all', 'points': 1234572, 'iou': 0.5, 'change': 0.25},
-    ],
-}
+    ['a note'],
+)  # fmt: skip
+CELLS = [
+    ['sequence', 'points', 'IoU [%]', 'peer IoU [%]', 'change'],
+    ['00', '1 234 567', '98.76', '25.00', '-0.1'],
+    ['08', '-', '-', '0.00', '-'],
+    ['all', '1 234 572', '50.00', '-', '+0.2'],
+]
 
 
-@pytest.mark.parametrize('form', FORMS)
-def test_forms_of_a_table(form):
-    assert getattr(TABLE, form)() == FORMS[form]
+def test_forms_of_a_table():
+    title, *lines, note = TABLE.text().splitlines()
+    assert (title, note) == ('Scores', 'a note')
+    assert [line.split() for line in lines] == [' '.join(row).split() for row in CELLS]
+    assert len({*map(len, lines)}) == 1
+    title, table, note = TABLE.markdown().split('\n\n')
+    titles, rule, *rows = (line.split('|')[1:-1] for line in table.splitlines())
+    assert [[cell.strip() for cell in row] for row in (titles, *rows)] == CELLS
+    assert [mark[-1] == ':' for mark in rule] == [False, True, True, True, True]
+    assert TABLE.json() == [
+        {'name': '00', 'points': 1234567, 'iou': 0.9876, 'peer_iou': 0.25, 'change': -0.001},
+        {'name': '08', 'points': None, 'iou': None, 'peer_iou': 2e-20, 'change': None},
+        {'name': 'all', 'points': 1234572, 'iou': 0.5, 'peer_iou': None, 'change': 0.25},
+    ]
 
 
-def test_long_titles_are_folded_in_the_terminal_only():
-    table = Table({Column('a'): ['b']}, title='word ' * 40)
+def test_long_titles_are_folded_in_the_terminal_only_and_no_rows_have_no_titles():
+    table = Table('word ' * 40, report.frame_of([], ['a']), {}, ['nothing'])
     assert max(map(len, table.text().splitlines())) <= report.WIDTH
+    assert table.text().splitlines()[-1] == 'nothing' and ' a' not in table.text()
     assert len(table.markdown().splitlines()[0]) > report.WIDTH
-
-
-def test_rows_of_several_units_of_another_length_and_none():
-    what = Column('what')
-    number = Column('n', ('.1f', '.3f'), scale=(100, 1))
-    table = Table({what: ['share', 'time'], number: [0.5, 2]})
-    assert table.text().splitlines()[2:] == ['share   50.0', 'time   2.000']
-    assert table.json() == [{'what': 'share', 'n': 0.5}, {'what': 'time', 'n': 2}]
-    with pytest.raises(ValueError, match='zip'):
-        Table({what: ['share', 'time'], number: [0.5]}).text()
-    nothing = Table({what: []}, 'title', ['nothing'])
-    assert (nothing.text(), nothing.json()) == ('title\n\nnothing', [])
-
-
-def test_counts_are_whole_numbers_also_where_a_column_has_gaps():
-    column = Column('lost', '_d')
-    table = Table({column: pd.Series([1200.0, math.nan])})
-    assert table.text().splitlines()[2:] == ['1 200', '    -']
-    assert table.json() == [{'lost': 1200}, {'lost': None}]
-    assert isinstance(table.json()[0]['lost'], int)
+    assert table.json() == []
 
 
 def test_json_files_have_null_for_what_is_undefined(tmp_path):
-    report.write_json({'a': [math.nan, {'b': (1.0, math.nan)}]}, tmp_path / 'a.json')
-    assert json.loads((tmp_path / 'a.json').read_text()) == {'a': [None, {'b': [1.0, None]}]}
-    report.write_json([np.int64(3), np.float64(math.nan), np.bool_(True)], tmp_path / 'b.json')
-    assert json.loads((tmp_path / 'b.json').read_text()) == [3, None, True]
+    rows = pd.DataFrame({'n': np.array([3]), 'x': [math.nan], 'is_so': [np.bool_(True)]})
+    found = Report({'table': TABLE}, report.records(rows), 'numba', {'cut': 0.5})
+    found.write(tmp_path / 'a.json', {'cpu': 'x'})
+    document = json.loads((tmp_path / 'a.json').read_text())
+    assert document == {
+        'cut': 0.5, 'backend': 'numba', 'environment': {'cpu': 'x'}, 'table': TABLE.json(),
+        'rows': [{'n': 3, 'x': None, 'is_so': True}],
+    }  # fmt: skip
+    assert isinstance(document['rows'][0]['n'], int)
 
 
 def test_parameters_and_environment_are_recorded():
@@ -111,27 +90,22 @@ def test_parameters_and_environment_are_recorded():
     assert 'commit' not in report.machine_line({**environment, 'commit': None})
 
 
-def git(folder, *words):
-    identity = ['-c', 'user.name=a', '-c', 'user.email=a@b', '-c', 'commit.gpgsign=false']
-    run = ['git', *identity, *words]
-    return subprocess.run(run, cwd=folder, check=True, capture_output=True, text=True).stdout
-
-
 def test_commit_is_that_of_the_source_or_none(tmp_path):
     source = tmp_path / 'package' / '__init__.py'
     source.parent.mkdir()
     source.write_text('')
     assert report._commit(source) is None
-    if shutil.which('git') is None:
-        return
-    git(tmp_path, 'init')
-    (tmp_path / 'other').write_text('')
-    git(tmp_path, 'add', 'other')
-    git(tmp_path, 'commit', '-m', 'another repository')
+
+    def git(*words):
+        identity = ['-c', 'user.name=a', '-c', 'user.email=a@b', '-c', 'commit.gpgsign=false']
+        subprocess.run(['git', *identity, *words], cwd=tmp_path, check=True, capture_output=True)
+
+    git('init')
+    git('commit', '--allow-empty', '-m', 'another repository')
     assert report._commit(source) is None  # inside a repository that is not its own
-    git(tmp_path, 'add', 'package')
-    git(tmp_path, 'commit', '-m', 'ours')
-    commit = git(tmp_path, 'rev-parse', 'HEAD').strip()
-    assert report._commit(source) == commit
+    git('add', 'package')
+    git('commit', '-m', 'ours')
+    commit = report._commit(source)
+    assert len(commit) == 40
     source.write_text('changed')
     assert report._commit(source) == f'{commit}-dirty'

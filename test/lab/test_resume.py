@@ -1,21 +1,18 @@
-"""Data sets that are segmented block by block: what is kept, and what is done again."""
+"""Data sets that are segmented into a folder: what is kept, and what is done again."""
 
-import fcntl
-import json
 import os
 import shutil
-import signal
 from pathlib import Path
 
-import numpy as np
 import pytest
-from bag_samples import scan, write_ros2_bag
-from cli_runner import INTERRUPTED, children, error_line, is_running, run, start, wait_for
-from evaluation_samples import label_files, write_streets, write_two_drives
+from bag_samples import write_ros2_bag
+from cli_runner import error_line, run
+from evaluation_samples import label_files, write_two_drives
 
+from gp_ground_seg import __version__
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.data import files
+from gp_ground_seg.cli import segment as command
+from gp_ground_seg.lab.dataset import PARAMETERS
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -25,10 +22,8 @@ def root(tmp_path_factory):
     return write_two_drives(tmp_path_factory.mktemp('root'))
 
 
-def finished(folder):
-    """Names in the record of what is written, in its order."""
-    lines = (folder / 'outputs.jsonl').read_text().splitlines()
-    return [name for line in lines for name in json.loads(line).get('written', {})]
+def times(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob('*')}
 
 
 def test_several_bags_become_one_each(tmp_path, capsys):
@@ -37,40 +32,62 @@ def test_several_bags_become_one_each(tmp_path, capsys):
         write_ros2_bag(tmp_path / f'{name}.mcap', n_clouds=2 + k)
         assert run('segment', tmp_path / f'{name}.mcap', '--quiet') == 0
     bags = [tmp_path / f'{name}.mcap' for name in names]
-    command = ['segment', *bags, '-o', tmp_path / 'out']
-    assert run(*command) == 0
+    words = ['segment', *bags, '-o', tmp_path / 'out']
+    assert run(*words) == 0
     for name in names:
         file = f'{name}_ground.mcap'
         assert (tmp_path / 'out' / file).read_bytes() == (tmp_path / file).read_bytes()
     assert '5 frames' in capsys.readouterr().out
-    # A block for each, which is kept if the next one is interrupted.
-    assert (tmp_path / 'out/outputs.jsonl').read_text().count('written') == len(names)
-    assert run(*command) == 0
+    assert run(*words) == 0
     assert capsys.readouterr().out == '2 of 2 were finished before\n'
     bags[1].unlink()
     write_ros2_bag(bags[1], n_clouds=4)
-    assert run(*command) == 0
+    assert run(*words) == 0
     assert capsys.readouterr().out.startswith('1 of 2 were finished before\n4 frames, ')
 
 
-def test_what_is_there_is_kept_and_other_parameters_are_refused(root, tmp_path, capsys):
+def test_what_is_there_is_kept_and_replaced_with_force_only(root, tmp_path, capsys):
     out = tmp_path / 'out'
-    command = ['segment', root, '-o', out]
-    assert run(*command) == 0
-    before, times = label_files(out), {path: path.stat().st_mtime_ns for path in out.rglob('*')}
-    assert run(*command) == 0
+    assert run('segment', root, '-o', out) == 0
+    before, known = label_files(out), times(out)
+    assert run('segment', root, '-o', out) == 0
     assert capsys.readouterr().out.endswith('12 of 12 were finished before\n')
-    assert {path: path.stat().st_mtime_ns for path in out.rglob('*')} == times
-    other = ['--set', 'label.ground_tolerance=0.2']
-    for words in (other, ['--columns', '4']):
-        assert run(*command, *words) == 2
-        assert f'{out}/parameters.yaml: says other parameters' in error_line(capsys)
-    assert label_files(out) == before
-    assert run(*command, '--force', *other) == 0
-    assert label_files(out) != before
-    assert sorted(finished(out)) == sorted(before)
-    assert run('config', 'check', out / 'parameters.yaml') == 0
+    assert times(out) == known
+    words = ['segment', root, '-o', out, '--set', 'label.ground_tolerance=0.2', '--force']
+    assert run(*words) == 0
+    assert label_files(out) != before and len(label_files(out)) == 12
+    assert run('config', 'check', out / PARAMETERS) == 0
     assert '1 differs from the defaults' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ('more', 'version', 'before', 'now'),
+    [
+        ('--set label.ground_tolerance=0.2', '', 'ground_tolerance: 0.1', 'ground_tolerance: 0.2'),
+        ('--columns 4', '', 'segment VERSION, from ROOT', 'segment VERSION, from ROOT, columns 4'),
+        ('', '9.9', 'segment VERSION, from ROOT', 'segment 9.9, from ROOT'),
+        ('OTHER', '', 'segment VERSION, from ROOT', 'segment VERSION, from OTHER'),
+    ],
+)
+def test_other_parameters_are_refused(
+    more, version, before, now, root, tmp_path, monkeypatch, capsys
+):
+    """The line says what differs, and what to do."""
+    out, other = tmp_path / 'out', tmp_path / 'other'
+    shutil.copytree(root, other)
+    assert run('segment', root, '-o', out) == 0
+    known = times(out)
+    if version:
+        monkeypatch.setattr(command, '__version__', version)
+    capsys.readouterr()
+    source = other if more == 'OTHER' else root
+    assert run('segment', source, '-o', out, *more.replace('OTHER', '').split()) == 2
+    said = error_line(capsys)
+    for name, value in (('VERSION', __version__), ('ROOT', root), ('OTHER', other)):
+        before, now = before.replace(name, str(value)), now.replace(name, str(value))
+    assert times(out) == known
+    assert said.startswith(f'{out / PARAMETERS}: says "') and before in said and now in said
+    assert said.endswith('; give another output folder, or --force to start anew')
 
 
 def test_a_folder_goes_on_with_the_backend_that_it_was_begun_with(root, tmp_path, monkeypatch):
@@ -84,179 +101,60 @@ def test_a_folder_goes_on_with_the_backend_that_it_was_begun_with(root, tmp_path
     assert run('segment', source, '-o', out, '--format', 'ply') == 0
     for file in whole.glob('*.ply'):
         assert (out / file.name).read_bytes() == file.read_bytes()
-    assert 'backend: numpy' in (out / 'parameters.yaml').read_text()
+    assert 'backend: numpy' in (out / PARAMETERS).read_text()
 
 
-def test_what_does_not_fit_is_done_again(root, tmp_path, capsys):
-    source, out, other = tmp_path / 'root', tmp_path / 'out', tmp_path / 'other'
+def test_what_is_missing_or_older_than_its_input_is_done_again(root, tmp_path, capsys):
+    source, out = tmp_path / 'root', tmp_path / 'out'
 
     def said(*words):
         capsys.readouterr()
-        assert run('segment', *words) == 0
+        assert run('segment', source, *words) == 0
         return capsys.readouterr().out
 
     shutil.copytree(root, source)
-    said(source, '-o', out)
-    inputs, outputs = sorted(source.rglob('*.bin')), sorted(out.rglob('*.label'))
-    # Another content of the same size; a file that was written before, as of `cp -p`.
-    (np.fromfile(inputs[0], '<f4').reshape(-1, 4) * (1, -1, 1, 1)).astype('<f4').tofile(inputs[0])
-    scan(9, n_ground=900).tofile(inputs[1])
-    os.utime(inputs[1], (1e9, 1e9))
-    for output in outputs[2], outputs[4], outputs[5]:
+    inputs = sorted(source.rglob('*.bin'))
+    os.truncate(inputs[9], 10)
+    assert run('segment', source, '-o', out) == 2
+    assert f'{inputs[9]}: 10 bytes is not a whole number' in error_line(capsys)
+    shutil.copyfile(inputs[0], inputs[9])
+    assert said('-o', out).startswith('9 of 12 were finished before\n3 frames, ')
+    outputs = sorted(out.rglob('*.label'))
+    shutil.copyfile(inputs[7], inputs[0])
+    for output in outputs[1:5]:
         output.unlink()
-    os.truncate(outputs[3], outputs[3].stat().st_size + 4)
-    outputs[4].symlink_to('nowhere')
-    inputs[5].unlink()
-    assert said(source, '-o', out).startswith('6 of 11 were finished before\n5 frames, ')
-    said(source, '-o', tmp_path / 'anew')
+    outputs[2].symlink_to('nowhere')
+    outputs[3].parent.joinpath(f'.{outputs[3].name}.partial-0').mkdir()  # of a run that was killed
+    inputs[4].unlink()
+    assert said('-o', out).startswith('7 of 11 were finished before\n4 frames, ')
+    said('-o', tmp_path / 'anew')
     assert label_files(out) == label_files(tmp_path / 'anew')
-    assert said(source, '-o', out) == '11 of 11 were finished before\n'
-    # A copy with its times is the same, but for the scans that have changed.
-    shutil.copytree(source, other)
-    files = sorted(other.rglob('*.bin'))
-    files[0].replace(files[1])
-    shutil.copy(files[2], files[0])
-    assert said(other, '-o', out).startswith('9 of 11 were finished before\n2 frames, ')
-    said(other, '-o', tmp_path / 'anew', '--force')
-    assert label_files(out) == label_files(tmp_path / 'anew')
+    assert said('-o', out) == '11 of 11 were finished before\n'
+    assert not [path for path in out.rglob('*') if '.partial-' in path.name]
+    # A run with --force was killed: it had written the parameters and one file.
+    (out / PARAMETERS).touch()
+    outputs[0].touch()
+    assert said('-o', out).startswith('1 of 11 were finished before\n10 frames, ')
 
 
-def flip(file):
-    """Another content of the same size."""
-    data = bytearray(file.read_bytes())
-    data[7] ^= 1
-    file.write_bytes(data)
+def test_a_file_has_its_name_when_it_is_on_disk(root, tmp_path, monkeypatch):
+    """A power failure leaves no hole in what is finished."""
+    calls, sync, rename = [], os.fsync, os.rename
 
-
-def test_a_changed_output_is_written_again_and_what_was_there_is_kept(root, tmp_path, capsys):
-    out = tmp_path / 'out'
-    command = ['segment', root, '-o', out]
-    assert run(*command) == 0
-    whole = label_files(out)
-    touched, changed = sorted(out.rglob('*.label'))[:2]
-    touched.touch()  # another time, as of a copy
-    flip(changed)
-    edited = changed.read_bytes()
-    capsys.readouterr()
-    assert run(*command) == 0
-    said = capsys.readouterr()
-    assert said.out.startswith('11 of 12 were finished before\n1 frame, ')
-    note = f'{changed}: was changed since it was written, is {changed.name}.changed now'
-    assert f'gp-ground-seg: note: {note}\n' in said.err
-    assert label_files(out) == whole
-    assert changed.with_name(f'{changed.name}.changed').read_bytes() == edited
-    flip(changed)
-    assert run(*command) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert f'{changed}: was changed since it was written, and {changed}.changed is there' in line
-    assert run(*command, '--force') == 0
-    assert label_files(out) == whole
-
-
-def test_all_is_on_disk_before_it_counts_as_finished(root, tmp_path, monkeypatch):
-    """Each file and the folders above it: a power failure leaves no hole in what is finished."""
-    flushed, lines, sync = [], [], os.fsync
-
-    def note(number):
-        path = Path(os.readlink(f'/proc/self/fd/{number}'))
-        if path.name == 'outputs.jsonl':
-            lines.append((path.read_text().splitlines()[-1], set(flushed)))
-        flushed.append(path.parent / path.name[1:].partition('.partial-')[0] or path)
-        flushed.append(path)
+    def note_sync(number):
         sync(number)
+        calls.append(Path(os.readlink(f'/proc/self/fd/{number}')))
 
-    monkeypatch.setattr(os, 'fsync', note)
+    def note_rename(source, target):
+        assert source in calls
+        rename(source, target)
+        calls.append(target)
+
+    monkeypatch.setattr(os, 'fsync', note_sync)
+    monkeypatch.setattr(os, 'rename', note_rename)
     out = tmp_path / 'out'
     assert run('segment', root, '-o', out) == 0
-    begun, *written = lines
-    assert 'to_write' in begun[0] and out / 'parameters.yaml' in begun[1]
-    names = set()
-    for line, before in written:
-        for name in json.loads(line)['written']:
-            names.add(name)
-            assert {out / name, *(out / name).parents} - {*out.parents} <= before
-    assert len(names) == 12
-    flushed.clear()
-    assert run('segment', next(root.rglob('*.bin')), '-o', tmp_path / 'a.label') == 0
-    assert flushed[-1] == tmp_path
-
-
-@pytest.mark.parametrize('line', [b'{', b'[' * 100_000, b'{"written": 3}', b'\xff', b'7', b'null'])
-def test_a_record_that_is_none(line, root, tmp_path, capsys):
-    (tmp_path / 'outputs.jsonl').write_bytes(line + b'\n')
-    assert run('segment', root, '-o', tmp_path) == 2
-    said = f'{tmp_path}/outputs.jsonl: line 1 is none of a record; --force starts anew'
-    assert error_line(capsys) == said
-    assert (tmp_path / 'outputs.jsonl').read_bytes() == line + b'\n'
-    assert run('segment', root, '-o', tmp_path, '--force') == 0
-
-
-def test_a_run_that_was_killed_goes_on_and_nothing_is_done_twice(root, tmp_path, capsys):
-    out = tmp_path / 'out'
-    command, record = ['segment', root, '-o', out], out / 'outputs.jsonl'
-    assert run(*command) == 0
-    whole = label_files(out)
-    planned, first, *_ = record.read_bytes().splitlines(keepends=True)
-    # It was writing a line, and a file.
-    record.write_bytes(planned + first + b'{"written": {"na')
-    (out / 'sequences/00/predictions/.000999.label.partial-0').touch()
-    before = [*json.loads(first)['written']]
-    assert 0 < len(before) < 12
-    times = {name: (out / name).stat().st_mtime_ns for name in before}
-    capsys.readouterr()
-    with record.open('rb') as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        for more in ('--force', '--quiet'):
-            assert run(*command, more) == 2
-            assert error_line(capsys) == f'{out}: another run writes to it'
-    assert run(*command) == 0
-    assert f'{len(before)} of 12 were finished before' in capsys.readouterr().out
-    assert sorted(finished(out)) == sorted(whole)
-    assert {name: (out / name).stat().st_mtime_ns for name in before} == times
-    assert label_files(out) == whole
-    assert not [path for path in out.rglob('*') if 'partial' in path.name]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
-def test_all_processes_end_with_a_run_that_is_stopped_and_nothing_is_lost(
-    tmp_path, capsys, number
-):
-    root, record = write_streets(tmp_path / 'root', s00=1), tmp_path / 'out/outputs.jsonl'
-    scan, *_ = root.rglob('*.bin')
-    for k in range(1, 600):
-        scan.with_name(f'{k:06d}.bin').hardlink_to(scan)
-    words = 'segment', root, '-o', record.parent
-    process = start(*words, '--workers', '2', start_new_session=True)
-    # The first line is of what is to be written.
-    wait_for(lambda: record.exists() and record.read_bytes().count(b'\n') >= 2, 'two lines')
-    workers = children(process.pid)
-    if number == signal.SIGINT:
-        os.killpg(process.pid, number)
-        assert process.communicate() == ('', 'gp-ground-seg: interrupted\n')
-        assert process.returncode in INTERRUPTED
-    else:
-        os.kill(workers[-1], signal.SIGKILL)
-        wait_for(lambda: record.read_bytes().count(b'\n') >= 5, 'three more lines')
-        workers += children(process.pid)
-        process.kill()
-        said = process.communicate()[1]
-        assert 'a worker died; computed again: ' in said and 'Traceback' not in said
-    wait_for(lambda: not any(map(is_running, workers)), 'end of all processes')
-    out, before = record.parent, finished(record.parent)
-    times = {name: (out / name).stat().st_mtime_ns for name in before}
-    assert 0 < len(before) < 600
-    assert run(*words) == 0
-    assert f'{len(before)} of 600 were finished before' in capsys.readouterr().out
-    assert {name: (out / name).stat().st_mtime_ns for name in before} == times
-    found = label_files(out)
-    assert sorted(finished(out)) == sorted(found) and len(found) == 600
-    assert len(set(found.values())) == 1
-    assert len(list((out / 'sequences/00/predictions').iterdir())) == 600
-
-
-def test_a_folder_of_that_name_is_kept(tmp_path):
-    (tmp_path / 'file').mkdir()
-    with pytest.raises(DataError, match='cannot be written'):
-        files.write_file(tmp_path / 'file', b'')
-    assert [p.name for p in tmp_path.iterdir()] == ['file']
+    written = [out / PARAMETERS, *(out / name for name in label_files(out))]
+    assert len(written) == 13
+    for path in written:
+        assert path.parent in calls[calls.index(path) :]

@@ -1,7 +1,5 @@
 """Whole data sets: one process, workers and a scheduler alike; what dies, and how it goes on."""
 
-import ast
-import contextlib
 import json
 import logging
 import os
@@ -11,14 +9,11 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import BrokenExecutor, Executor, Future
 from functools import partial
-from pathlib import Path
-from threading import Event, Thread, Timer
 
 import pytest
-from cli_runner import INTERRUPTED, children, error_line, is_running, run, start
-from evaluation_samples import label_files, write_two_drives
+from cli_runner import INTERRUPTED, children, error_line, is_running, run, start, wait_for
+from evaluation_samples import label_files, write_streets, write_two_drives
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -26,6 +21,7 @@ from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.lab import cluster
 
 dask, distributed = pytest.importorskip('dask'), pytest.importorskip('distributed')
+psutil = pytest.importorskip('psutil')  # of distributed
 # Dask leaves sockets and event loops to the garbage collector when its processes end.
 pytestmark = [
     pytest.mark.usefixtures('compiled_code'),
@@ -39,13 +35,27 @@ def root(tmp_path_factory):
 
 
 @pytest.fixture(scope='module')
-def scheduler():
-    """Address of a cluster of two workers that was not started by a command."""
+def locked_scheduler():
+    """Address of a cluster of two workers that was not started by a command, and its keys."""
+    security = distributed.Security.temporary()
+    config = {
+        'distributed.comm.tls.ca-file': security.tls_ca_file,
+        'distributed.comm.tls.client.cert': security.tls_client_cert,
+        'distributed.comm.tls.client.key': security.tls_client_key,
+    }
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address='127.0.0.1:0',
+        n_workers=2, threads_per_worker=1, dashboard_address='127.0.0.1:0', security=security,
         silence_logs=logging.CRITICAL,
     ) as started:  # fmt: skip
-        yield started.scheduler_address
+        yield started.scheduler_address, config
+
+
+@pytest.fixture
+def scheduler(locked_scheduler):
+    """Address of a scheduler to which Dask's configuration has the keys."""
+    address, config = locked_scheduler
+    with dask.config.set(config):
+        yield address
 
 
 def everything(path):
@@ -158,159 +168,93 @@ def test_results_are_those_of_one_process_also_if_a_worker_dies(workers, tmp_pat
     assert caplog.messages == ['the surface is odd']
     with pytest.raises(DataError, match=r'^00/000003: truncated\?'):
         workers.run(_fail, range(40))
-
-
-def test_a_block_that_ends_every_worker_is_named(workers):
-    with pytest.raises(DataError, match='died') as caught:
+    with pytest.raises(DataError, match='each worker that computed this block died'):
         workers.run(_die, [7])
-    assert '7' in str(caught.value)
 
 
-def test_a_worker_that_dies_before_the_work_begins(caplog):
-    is_first = True
-
-    @contextlib.contextmanager
-    def opened():
-        nonlocal is_first
-        with cluster._processes(1) as executor:
-            if is_first:
-                is_first = False
-                assert isinstance(executor.submit(_die, [0], iter).exception(), BrokenExecutor)
-            yield executor
-
-    runner = cluster.Runner(open_executor=opened, n_workers=1)
-    assert runner.run(_last_first, range(3)) == [0, 2]
-    assert caplog.messages == ['a worker died; computed again: 2 blocks']
-
-
-def listening():
-    """Sockets of this machine that wait for connections, by inode."""
-    found = set()
-    for name in ('tcp', 'tcp6', 'unix'):
-        rows = [line.split() for line in Path(f'/proc/net/{name}').read_text().splitlines()[1:]]
-        if name == 'unix':  # flag of a listening socket, see proc(5)
-            found |= {row[6] for row in rows if int(row[3], 16) & 0x10000}
-        else:
-            found |= {row[9] for row in rows if row[3] == '0A'}
-    return found
-
-
-def sockets(pid):
-    found = set()
-    for path in Path(f'/proc/{pid}/fd').iterdir():
-        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
-            found.add(os.readlink(path))
-    return {link[8:-1] for link in found if link.startswith('socket:[')}
-
-
-def _sockets_that_listen(block, progress):
-    # A worker looks at its parent, itself and the other workers.
-    parent = os.getppid()
-    pids = [parent, *children(parent)]
-    return len(pids), [pid for pid in pids if sockets(pid) & listening()]
-
-
-def test_nothing_listens_with_workers(scheduler):
-    assert sockets(os.getpid()) & listening()  # as that scheduler does
-    code = (
-        'from gp_ground_seg.lab import cluster; import test_scale; '
-        'context = cluster.open_runner(2, None, cluster._NO_BAR); runner = context.__enter__(); '
-        'print(runner.run(test_scale._sockets_that_listen, range(8)))'
-    )
-    folder = Path(__file__).parent
-    done = subprocess.run(
-        [sys.executable, '-c', code], cwd=folder, capture_output=True, text=True, check=True
-    )
-    found = ast.literal_eval(done.stdout)
-    assert len(found) == 4
-    assert all(n >= 3 and not pids for n, pids in found), found
-
-
-def test_more_workers_than_a_machine_has_use_for(root, tmp_path, capsys):
-    assert run('segment', root, '-o', tmp_path / 'out', '--workers', '99999999999') == 2
-    assert 'must be 1 to' in error_line(capsys)
-    assert not (tmp_path / 'out').exists()
-
-
-class InThread(Executor):
-    """A thread that does not keep Python from ending where it hangs."""
-
-    def submit(self, function, /, *args):
-        future = Future()
-        self.thread = Thread(target=lambda: future.set_result(function(*args)), daemon=True)
-        self.thread.start()
-        return future
-
-
-def test_ctrl_c_between_any_two_lines_of_the_wait_leaves_no_lock():
-    """Or the executor could not set the result, and would never end."""
-    last = 1
-    while last:
-        executor, gate, n_lines = InThread(), Event(), 0
-
-        def wait(block, progress, gate=gate):
-            gate.wait()
-
-        def interrupt(frame, event, _, executor=executor, last=last):
-            nonlocal n_lines
-            if 'concurrent/futures' in frame.f_code.co_filename and hasattr(executor, 'thread'):
-                n_lines += 1
-                if n_lines == last:
-                    sys.settrace(None)
-                    signal.raise_signal(signal.SIGINT)
-            return interrupt
-
-        runner = cluster.Runner(open_executor=partial(contextlib.nullcontext, executor))
-        opener = Timer(0.05, gate.set)
-        opener.start()
-        sys.settrace(interrupt)
-        try:
-            runner.run(wait, [1])
-            last = 0
-        except KeyboardInterrupt:
-            last += 1
-        finally:
-            sys.settrace(None)
-        opener.join()
-        executor.thread.join(10)
-        assert not executor.thread.is_alive(), f'at line {last}'
-    assert n_lines > 10
-
-
-@pytest.mark.parametrize('delay', [0.0, 0.1, 0.3])
-def test_ctrl_c_while_workers_start(delay, root, tmp_path):
-    process = start(
-        'segment', root, '-o', tmp_path / 'out', '--workers', '2', start_new_session=True
-    )
-    deadline, started = time.monotonic() + 60, []
-    while len(started) < 2:  # the tracker of resources, and a worker
-        assert process.poll() is None and time.monotonic() < deadline
-        started = children(process.pid)
-    time.sleep(delay)
-    started = children(process.pid)
-    os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    assert (out, err) == ('', 'gp-ground-seg: interrupted\n')
-    assert process.returncode in INTERRUPTED
-    while any(map(is_running, started)):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+def test_workers_speak_tls_and_are_seen_on_this_machine_only():
+    with cluster.open_runner(2, None, cluster._NO_BAR) as runner:
+        assert runner.run(_last_first, range(4)) == [0, 1, 2, 3]
+        family = [psutil.Process(), *psutil.Process().children()]
+        sockets = [socket for process in family for socket in process.net_connections()]
+        assert {s.laddr.ip for s in sockets if s.status == psutil.CONN_LISTEN} == {'127.0.0.1'}
+        assert runner._client.scheduler.address.startswith('tls://')
 
 
 @pytest.mark.parametrize(
-    ('address', 'problem'),
+    ('words', 'missing', 'problem'),
     [
-        ('tcp://127.0.0.1:1', 'does not answer'),
-        ('tls://127.0.0.1:1', 'does not answer'),
-        ('somewhere', 'must be tcp://HOST:PORT'),
+        ('--workers 99999999999', None, 'must be 1 to'),
+        ('--workers 1', 'distributed', 'pip install distributed cryptography'),
+        ('--workers 1', 'cryptography', 'pip install distributed cryptography'),
+        ('--scheduler tcp://127.0.0.1:1', 'distributed', 'pip install distributed cryptography'),
+        ('--scheduler tcp://127.0.0.1:1', None, 'does not answer'),
+        ('--scheduler tls://127.0.0.1:1', None, 'does not answer'),
+        ('--scheduler somewhere', None, 'must be tcp://HOST:PORT'),
+        ('--scheduler LOCKED', None, 'does not answer'),
     ],
 )
-def test_a_scheduler_that_is_not_there(address, problem, root, monkeypatch, tmp_path, capsys):
-    command = ['segment', root, '-o', tmp_path / 'out']
-    monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT', 0.2)
-    assert run(*command, '--scheduler', address) == 2
+def test_refused_in_one_line(
+    words, missing, problem, root, locked_scheduler, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT', 0.5)
+    if missing:
+        monkeypatch.setitem(sys.modules, missing, None)
+    words = words.replace('LOCKED', locked_scheduler[0]).split()
+    assert run('segment', root, '-o', tmp_path / 'out', *words) == 2
     assert problem in error_line(capsys)
-    assert run(*command) == 0
+    assert not (tmp_path / 'out').exists()
+
+
+def labels_in(folder):
+    return [path for path in folder.rglob('*') if path.suffix == '.label']
+
+
+@pytest.mark.parametrize(
+    ('moment', 'victim'),
+    [
+        ('a worker starts', 'all'),
+        ('files are written', 'all'),
+        pytest.param('files are written', 'the run', marks=pytest.mark.slow),
+        pytest.param('files are written', 'a worker', marks=pytest.mark.slow),
+    ],
+)
+def test_processes_that_are_stopped_leave_nothing_half_done(moment, victim, tmp_path, capsys):
+    """Ctrl-C, which all processes of a terminal get, or `kill -9` of one."""
+    root, out, n_scans = write_streets(tmp_path / 'root', s00=1), tmp_path / 'out', 400
+    scan, *_ = root.rglob('*.bin')
+    os.utime(scan, (1e9, 1e9))
+    for k in range(1, n_scans):
+        scan.with_name(f'{k:06d}.bin').hardlink_to(scan)
+    words = 'segment', root, '-o', out
+    process = start(*words, '--workers', '2', '--quiet', start_new_session=True)
+    # The first child is the tracker of resources.
+    started = 2 if moment == 'a worker starts' else 3
+    wait_for(lambda: len(children(process.pid)) >= started, 'worker')
+    if moment == 'files are written':
+        wait_for(lambda: labels_in(out), 'labels')
+    workers = children(process.pid)
+    if victim == 'all':
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.communicate() == ('', 'gp-ground-seg: interrupted\n')
+        assert process.returncode in INTERRUPTED
+    elif victim == 'the run':
+        process.kill()
+        assert 'Traceback' not in process.communicate()[1]
+    else:
+        os.kill(workers[-1], signal.SIGKILL)
+        said, errors = process.communicate()
+        assert (process.returncode, errors) == (0, '') and f'{n_scans} frames' in said
+    wait_for(lambda: not any(map(is_running, workers)), 'end of all processes')
+    times = {path: path.stat().st_mtime_ns for path in labels_in(out)}
+    assert (len(times) == n_scans) == (victim == 'a worker')
+    assert run(*words) == 0
+    said = capsys.readouterr().out
+    assert not times or said.startswith(f'{len(times)} of {n_scans} were finished before\n')
+    assert {path: path.stat().st_mtime_ns for path in times} == times
+    found = label_files(out)
+    assert len(found) == n_scans and len({*found.values()}) == 1
+    assert len([*(out / 'sequences/00/predictions').iterdir()]) == n_scans
 
 
 def test_a_scheduler_that_ends_meanwhile(root, tmp_path):
@@ -332,25 +276,7 @@ def test_a_scheduler_that_ends_meanwhile(root, tmp_path):
             '', 'gp-ground-seg: error: the scheduler is lost\n'
         )  # fmt: skip
         assert process.returncode == 2
-
-
-def test_a_scheduler_that_asks_for_a_key(root, tmp_path, capsys):
-    security = distributed.Security.temporary()
-    config = {
-        'distributed.comm.tls.ca-file': security.tls_ca_file,
-        'distributed.comm.tls.client.cert': security.tls_client_cert,
-        'distributed.comm.tls.client.key': security.tls_client_key,
-    }
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address='127.0.0.1:0', security=security,
-        silence_logs=logging.CRITICAL,
-    ) as started:  # fmt: skip
-        command = ['segment', root, '-o', tmp_path, '--scheduler', started.scheduler_address]
-        assert run(*command) == 2
-        assert 'does not answer' in error_line(capsys)
-        with dask.config.set(config):
-            assert run(*command) == 0
-    assert len(label_files(tmp_path)) == 12
+    assert not (tmp_path / 'out').exists()
 
 
 def test_workers_of_other_versions():
@@ -361,18 +287,10 @@ def test_workers_of_other_versions():
         cluster._compute_block({**here, 'gp_ground_seg': '9.9'}, _log, [1])
 
 
-def test_without_the_extra(root, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, 'distributed', None)
-    monkeypatch.chdir(tmp_path)
-    assert run('segment', root, '--scheduler', 'tcp://127.0.0.1:1') == 2
-    assert 'pip install distributed' in error_line(capsys)
-
-
-@pytest.mark.parametrize('more', [[], ['--workers', '1']])
-def test_this_machine_needs_no_dask(more, root, tmp_path):
+def test_one_process_needs_no_dask(root, tmp_path):
     code = (
         'import sys; from gp_ground_seg.cli.main import main; main(sys.argv[1:]); '
         'assert not {"dask", "distributed"} & set(sys.modules)'
     )
-    command = [sys.executable, '-c', code, 'segment', root, '-o', tmp_path / 'out', *more]
+    command = [sys.executable, '-c', code, 'segment', root, '-o', tmp_path / 'out']
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

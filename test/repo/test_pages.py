@@ -17,7 +17,7 @@ from gp_ground_seg.cli import demo
 from gp_ground_seg.cli.main import COMMANDS, build_parser
 from gp_ground_seg.core.jit import JIT_ENABLED
 from gp_ground_seg.lab.plotting import plot_scan_view
-from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
+from gp_ground_seg.lab.scoring.metrics import true_labels
 
 figures = load_script('docs/figures.py')
 generate = load_script('docs/generate.py')
@@ -143,7 +143,7 @@ def test_the_picture_of_the_demo_is_that_of_the_demo(tmp_path):
         scan for _, scan in zip(range(number), demo.simulated_drive(30), strict=False)
     )
     label = GroundSegmenter().segment(points).label
-    truth = GROUNDGRID.truth(semantic, points[:, 2])
+    truth = true_labels(semantic)
     counts = plot_scan_view(points, label, tmp_path / 'a.png', truth=truth)
     assert f'(scan {number}: {counts}; commit ' in figure.body, f'now {counts}. {ANEW}'
 

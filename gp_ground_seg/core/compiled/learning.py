@@ -13,17 +13,26 @@ from gp_ground_seg.core.frame import FloatArray, Frame, Inliers
 from gp_ground_seg.core.gp.evidence import is_low_and_near
 from gp_ground_seg.core.gp.learning import (
     BUDGET,
-    CONVERGED,
-    FAILED,
     FARTHEST_START,
     ThetaSpace,
-    log_prior,
+    maximise,
     missed_by_line,
-    slope_of_prior,
+    set_likelihood,
 )
-from gp_ground_seg.core.gp.search import Search, begin, propose, search_from, take_outcome
-from gp_ground_seg.core.jit import jit
+from gp_ground_seg.core.gp.search import search_from
+from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, LearningConfig, ObservationConfig
+
+
+@compiled_form(set_likelihood)
+def _set_likelihood(
+    theta: FloatArray,
+    inliers: Inliers,
+    slope_std: float,
+    latent_terms: bool,
+    gradient: FloatArray,
+) -> float:
+    return log_likelihood(theta, inliers, slope_std, latent_terms, gradient)
 
 
 @jit(entry=True)
@@ -67,7 +76,7 @@ def learn_frame(
             break
         n_before = len(inliers.r)
         slope_std = observation.slope_std
-        n_evaluations += _maximise(
+        n_evaluations += maximise(
             space, inliers, slope_std, is_map, budget, search, theta, outcome
         )
         budget = learning.max_evaluations - n_evaluations
@@ -99,7 +108,7 @@ def _set_first_theta(frame: Frame, growth: GrowthConfig, theta: FloatArray) -> N
 
 @jit(part=True)
 def _set_seeds(frame: Frame, growth: GrowthConfig, step: int, by_itself: SegmentSurfaces) -> None:
-    """Set the seeds of every `step`-th segment: without evidence from aside, all that are low."""
+    """Set the seeds of every `step`-th segment: without neighbours, all that are low."""
     candidates = frame.candidates
     for m in range(0, len(candidates.offsets) - 1, step):
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
@@ -134,51 +143,3 @@ def _take_inliers(
                 p += 1
         offsets[k + 1], bar_offsets[k + 1] = n, p
     return Inliers(offsets, r[:n], z[:n], u[:n], bar_offsets, r_bar, log_extent, kind)
-
-
-@jit(part=True)
-def _maximise(
-    space: ThetaSpace,
-    inliers: Inliers,
-    slope_std: float,
-    is_map: bool,
-    max_evaluations: int,
-    search: Search,
-    theta: FloatArray,
-    outcome: FloatArray,
-) -> int:
-    """See the plain `maximise`; an entry that is not free stays where its slope goes on rising."""
-    n_data, slope, any_free = len(inliers.r), np.empty(len(theta)), False
-    for i in range(len(theta)):
-        theta[i] = min(max(theta[i], space.lower[i]), space.upper[i])
-        any_free |= space.free[i]
-        search.lower[i] = space.lower[i] if space.free[i] else theta[i]
-        search.upper[i] = space.upper[i] if space.free[i] else theta[i]
-    outcome[0], outcome[1] = -math.inf, CONVERGED
-    if n_data == 0 or not any_free:
-        return 0
-    begin(search, theta)
-    n_evaluations, status = 0, BUDGET
-    while n_evaluations < max_evaluations:
-        for i in range(len(theta)):
-            theta[i] = search.trial[i]
-        value = log_likelihood(theta, inliers, slope_std, not is_map, slope)
-        for i in range(len(theta)):
-            if not space.free[i]:
-                slope[i] = 1.0
-                continue
-            if is_map:
-                value += log_prior(theta[i], space.centre[i], space.prior_std)
-                slope[i] += slope_of_prior(theta[i], space.centre[i], space.prior_std)
-            slope[i] /= n_data
-        n_evaluations += 1
-        if n_evaluations == 1 and not math.isfinite(value):
-            status = FAILED
-            break
-        if take_outcome(search, value / n_data, slope) or not propose(search):
-            status = CONVERGED
-            break
-    for i in range(len(theta)):
-        theta[i] = search.x[i]
-    outcome[0], outcome[1] = search.value[0] * n_data, status
-    return n_evaluations

@@ -8,25 +8,22 @@ for each class of lines. All segments of a frame share it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.core.frame import (
     BoolArray,
-    Candidates,
     FloatArray,
     Frame,
     Inliers,
-    IntArray,
     PseudoInputs,
     Values,
 )
 from gp_ground_seg.core.gp.ground import estimate_surface
 from gp_ground_seg.core.gp.likelihood import log_likelihood
-from gp_ground_seg.core.gp.search import propose, search_from, take_outcome
+from gp_ground_seg.core.gp.search import Search, begin, propose, search_from, take_outcome
 from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.lines import N_CLASSES, class_middles
@@ -35,7 +32,6 @@ THETA_NAMES = (
     'sigma_f', 'sigma_n', 'sigma_f_bar', 'sigma_l_bar', 'sigma_n_bar', 'length_scale_factor'
 )  # fmt: skip
 """Entries of theta; with classes the last one is there for each, numbered."""
-Objective = Callable[[FloatArray], tuple[float, FloatArray]]
 
 WIDEST = 5.0
 """Distance from the given value to the bounds, in standard deviations of the prior."""
@@ -168,71 +164,50 @@ def learn_frame(frame: Frame, config: Config) -> Learned:
     """Learn theta on the inliers that grow under it, then on those under what was learned, ...
 
     It ends when the inliers of a later round are no more than before, or when
-    ``learning.max_evaluations`` are spent, of which the first round has half. Every
+    ``learning.max_evaluations`` are spent; the first round has half of them. Every
     ``learning.segment_step``-th segment is used.
     """
     learning, space = config.learning, theta_space(config)
     thin = every_segment(frame, learning.segment_step)
     has_latent = bool(space.free[2:].any())
     is_map, slope_std = learning.objective == 'map', config.observation.slope_std
-    learned = Learned.of(first_theta(frame, config), -math.inf, 0, BUDGET, space)
-    numbers: list[int] = []
+    theta, outcome = first_theta(frame, config), np.array([-math.inf, BUDGET])
+    search = search_from(theta, space.lower.copy(), space.upper.copy())
+    n_rounds = n_before = n_evaluations = 0
     budget = max(learning.max_evaluations // 2, 1)
     while budget > 0:
-        surface, _, u = estimate_surface(thin, learned.theta, config)
-        numbers.append(int(surface.inlier.sum()))
-        if len(numbers) > 2 and numbers[-1] <= numbers[-2]:
-            break
+        surface, _, u = estimate_surface(thin, theta, config)
         inliers = take_inliers(thin, surface.inlier, u, has_latent)
-        found = maximise(
-            partial(log_likelihood, inliers=inliers, slope_std=slope_std, latent_terms=not is_map),
-            space,
-            learned.theta,
-            len(inliers.r),
-            use_priors=is_map,
-            max_evaluations=budget,
+        n_rounds += 1
+        if n_rounds > 2 and len(inliers.r) <= n_before:
+            break
+        n_before = len(inliers.r)
+        n_evaluations += maximise(
+            space, inliers, slope_std, is_map, budget, search, theta, outcome
         )
-        learned = found._replace(n_evaluations=learned.n_evaluations + found.n_evaluations)
-        budget = learning.max_evaluations - learned.n_evaluations
-    return learned
+        budget = learning.max_evaluations - n_evaluations
+    return Learned.of(theta, float(outcome[0]), n_evaluations, int(outcome[1]), space)
 
 
 def every_segment(frame: Frame, step: int) -> Frame:
-    """Every `step`-th segment of a frame, by itself and without knots."""
-    no_knots = frame._replace(knots=frame.knots[:0])
-    if step == 1:
-        return no_knots
+    """Frame without knots, and with candidates in every `step`-th segment only."""
     candidates, pseudo = frame.candidates, frame.pseudo
-
-    def thin(offsets: IntArray) -> tuple[IntArray, IntArray]:
-        """Places of the values that are kept, and their offsets."""
-        first, stop = offsets[:-1:step], offsets[1::step]
-        places = [np.arange(*ends) for ends in zip(first.tolist(), stop.tolist(), strict=False)]
-        return np.concatenate(places), np.concatenate([[0], np.cumsum(stop - first)])
-
-    kept, offsets = thin(candidates.offsets)
-    kept_bar, bar_offsets = thin(pseudo.offsets)
-    return no_knots._replace(
-        candidates=Candidates(
-            candidates.r[kept],
-            candidates.z[kept],
-            candidates.bin[kept],
-            candidates.density[kept],
-            offsets,
-            candidates.tile[kept],
-            candidates.x[kept],
-            candidates.y[kept],
-        ),
+    is_used = np.arange(candidates.n_segments) % step == 0
+    kept = is_used[candidates.segment]
+    kept_bar = np.repeat(is_used, np.diff(pseudo.offsets))
+    return frame._replace(
+        candidates=candidates.where(kept),
         lines=frame.lines._replace(line=frame.lines.line[kept]),
         pseudo=PseudoInputs(
             pseudo.r_bar[kept_bar],
             pseudo.log_extent[kept_bar],
-            bar_offsets,
+            np.concatenate([[0], np.cumsum(kept_bar)])[pseudo.offsets],
             pseudo.line[kept_bar],
             pseudo.kind[kept_bar],
         ),
         continues_line=frame.continues_line[kept],
         in_face=frame.in_face[kept],
+        knots=frame.knots[:0],
     )
 
 
@@ -256,42 +231,68 @@ def take_inliers(frame: Frame, inlier: BoolArray, u: FloatArray, has_latent: boo
     )
 
 
-def maximise(
-    objective: Objective,
-    space: ThetaSpace,
-    start: FloatArray,
-    n_data: int,
-    *,
-    use_priors: bool,
-    max_evaluations: int,
-) -> Learned:
-    """Maximise objective plus log priors from `start`, within bounds and budget.
+def set_likelihood(
+    theta: FloatArray,
+    inliers: Inliers,
+    slope_std: float,
+    latent_terms: bool,
+    gradient: FloatArray,
+) -> float:
+    """Return the value of `log_likelihood`, and set its `gradient` (T,)."""
+    value, gradient[:] = log_likelihood(theta, inliers, slope_std, latent_terms)
+    return value
 
-    `objective` gives the log marginal likelihood of a theta and its gradient, ``-inf`` is allowed;
-    `start` is in log space, `n_data` the number of inliers. The best theta so far is returned
-    after `max_evaluations`.
+
+@shared
+def maximise(
+    space: ThetaSpace,
+    inliers: Inliers,
+    slope_std: float,
+    is_map: bool,
+    max_evaluations: int,
+    search: Search,
+    theta: FloatArray,
+    outcome: FloatArray,
+) -> int:
+    """Maximise likelihood, and with `is_map` log priors, from `theta` (T,), within the bounds.
+
+    The best theta so far replaces `theta` after `max_evaluations`. Sets `outcome` (2,) to the
+    objective and the place of the status in `STATUSES`, and returns the number of evaluations.
     """
-    free, theta = np.flatnonzero(space.free), np.clip(start, space.lower, space.upper)
-    if len(free) == 0 or n_data == 0 or max_evaluations == 0:
-        return Learned.of(theta, -math.inf, 0, CONVERGED, space)
-    search = search_from(theta[free], space.lower[free], space.upper[free])
-    centre, n_evaluations, status = space.centre[free], 0, BUDGET
+    n_data, slope, any_free = len(inliers.r), np.empty(len(theta)), False
+    for i in range(len(theta)):
+        theta[i] = min(max(theta[i], space.lower[i]), space.upper[i])
+        any_free |= space.free[i]
+        search.lower[i] = space.lower[i] if space.free[i] else theta[i]
+        search.upper[i] = space.upper[i] if space.free[i] else theta[i]
+    outcome[0], outcome[1] = -math.inf, CONVERGED
+    if n_data == 0 or not any_free:
+        return 0
+    begin(search, theta)
+    n_evaluations, status = 0, BUDGET
     while n_evaluations < max_evaluations:
-        theta[free] = search.trial
-        value, gradient = objective(theta)
-        gradient = gradient[free]
-        if use_priors:
-            value += float(log_prior(search.trial, centre, space.prior_std).sum())
-            gradient = gradient + slope_of_prior(search.trial, centre, space.prior_std)
+        for i in range(len(theta)):
+            theta[i] = search.trial[i]
+        value = set_likelihood(theta, inliers, slope_std, not is_map, slope)
+        for i in range(len(theta)):
+            if not space.free[i]:
+                slope[i] = 1.0  # it stays at its upper bound
+                continue
+            if is_map:
+                value += log_prior(theta[i], space.centre[i], space.prior_std)
+                slope[i] += slope_of_prior(theta[i], space.centre[i], space.prior_std)
+            slope[i] /= n_data
         n_evaluations += 1
         if n_evaluations == 1 and not math.isfinite(value):
             status = FAILED
             break
-        if take_outcome(search, value / n_data, gradient / n_data) or not propose(search):
+        if take_outcome(search, value / n_data, slope) or not propose(search):
             status = CONVERGED
             break
-    theta[free] = search.x
-    return Learned.of(theta, search.value[0] * n_data, n_evaluations, status, space)
+    for i in range(len(theta)):
+        theta[i] = search.x[i]
+    outcome[0], outcome[1] = search.value[0] * n_data, status
+    return n_evaluations
 
 
 @shared

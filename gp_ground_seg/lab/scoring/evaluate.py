@@ -1,14 +1,13 @@
 """Methods over scans whose truth is known, and their scores: frames of pandas.
 
-A row has sums, which `groupby` adds up: a table is sums over some rows, then ratios of them. The
-only module that imports pandas.
+A row has sums, which `groupby` adds up: a table is sums over some rows, then ratios of them.
 """
 
 from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
@@ -18,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.backend import Backend
-from gp_ground_seg.core.errors import DataError, PointCloudError, require, shown
+from gp_ground_seg.core.errors import DataError, PointCloudError, shown
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
@@ -26,8 +25,9 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import Frame, read_entries, read_points
 from gp_ground_seg.lab.cluster import HERE, Progress, Runner
 from gp_ground_seg.lab.scoring import metrics, objects
-from gp_ground_seg.lab.scoring.metrics import CONVENTIONS, COUNTS, GROUNDGRID, Labels
+from gp_ground_seg.lab.scoring.metrics import COUNTS, Labels
 from gp_ground_seg.lab.scoring.objects import OBJECT_COUNTS, CutScan, Objects
+from gp_ground_seg.lab.scoring.report import frame_of, require_pandas
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -116,8 +116,7 @@ class KnownScan:
     sequence: str  # or another group of scans that belong together
     index: str  # name within it
     points: npt.NDArray[Any]  # (N, >=3) x, y, z [m], and intensity
-    truths: dict[str, Labels]
-    """True `Label` (N,) by convention, the one that counts first; UNKNOWN does not count."""
+    truth: Labels | None = None  # (N,) true `Label`, if known; UNKNOWN does not count
     semantic: npt.NDArray[np.integer] | None = None  # (N,) classes, if known
     ground_z: npt.NDArray[np.floating] | None = None  # (N,) true height of the ground [m]
     is_ground: BoolArray | None = None  # (N,) points under which the surface is compared with it
@@ -145,17 +144,12 @@ def load_kitti(frame: Frame, cut: float = 0.0) -> KnownScan:
     entries = read_entries(frame.labels_path, len(points))
     semantic = (entries & 0xFFFF).astype(np.uint16)
     z = points[:, 2].astype(np.float64)
-    truths = {rule.key: rule.truth(semantic, points[:, 2]) for rule in CONVENTIONS}
-    is_ground = truths[GROUNDGRID.key] == Label.GROUND
+    truth = metrics.true_labels(semantic)
+    is_ground = truth == Label.GROUND
     found = objects.labelled_objects(points, entries, is_ground)
     names = shown(frame.sequence), shown(frame.index)
     low = objects.cut_objects(points, found.class_of >= 0, is_ground, cut) if cut else None
-    return KnownScan(*names, points, truths, semantic, z, is_ground, found, cut=low)
-
-
-def as_it_is(scan: KnownScan) -> KnownScan:
-    """Return a scan that is in memory already."""
-    return scan
+    return KnownScan(*names, points, truth, semantic, z, is_ground, found, cut=low)
 
 
 def score_methods(
@@ -176,22 +170,23 @@ def score_methods(
     Of scans with a `KnownScan.cut`, which all have or none, copies of the methods run on it, in
     the same order, without being timed.
     """
-    require_pandas()
-    score = partial(_score_block, load, methods, each_alone, clock)
+    require_pandas()  # before any scan is read
+    score = partial(score_rows, load, methods, each_alone=each_alone, clock=clock)
     has_past = not each_alone and any(method.depends_on_past for method in methods)
     return make_scores(runner.run(score, items, attrgetter('sequence') if has_past else None))
 
 
-def _score_block(
+def score_rows(
     load: Callable[[Any], KnownScan],
     methods: Sequence[Method],
-    each_alone: bool,
-    clock: Callable[[], float],
     items: Sequence[Any],
-    progress: Progress,
+    progress: Progress = iter,
+    *,
+    each_alone: bool,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> Rows:
     """Rows of some scans, by frame."""
-    rows: Rows = {}
+    rows: Rows = {name: [] for name in COLUMNS}
     sequence = None
     for k, item in enumerate(progress(items)):
         scan = load(item)
@@ -219,7 +214,7 @@ def _score_block(
             }
             keys = {'method': method.name, 'sequence': scan.sequence, 'index': scan.index}
             for name, found in own.items():
-                rows.setdefault(name, []).extend(keys | row for row in found)
+                rows[name] += (keys | row for row in found)
     return rows
 
 
@@ -241,17 +236,15 @@ def _low_things(scan: KnownScan, method: Method, *, forgets: bool) -> dict[str, 
 
 
 def _score(scan: KnownScan, result: MethodResult | Segmentation) -> Rows:
-    """Rows of a scan, by frame."""
+    """Rows of a scan, by frame. What else is counted of a labelled scan gets its line here."""
     label, rows = result.label, Rows()
     sums: dict[str, Any] = {'cluster': scan.cluster or scan.sequence, 'n_scans': 1}
     sums['points'] = len(label)
-    for key, truth in scan.truths.items():
-        counts = metrics.count_labels(label, truth)
-        sums |= {f'{key}_{name}': n for name, n in counts.items()}
-    for truth in [*scan.truths.values()][:1]:
-        rows['rings'] = metrics.count_rings(label, truth, scan.points)
+    if scan.truth is not None:
+        sums |= metrics.count_labels(label, scan.truth)
+        rows['rings'] = metrics.count_rings(label, scan.truth, scan.points)
         if result.p_ground is not None:
-            rows['bins'] = metrics.count_bins(result.p_ground, truth)
+            rows['bins'] = metrics.count_bins(result.p_ground, scan.truth)
     if scan.ground_z is not None and scan.is_ground is not None:
         ground, std = scan.is_ground, getattr(result, scan.std, None)
         sums |= metrics.height_sums(
@@ -274,16 +267,14 @@ class Scores(NamedTuple):
 
     Attributes
     ----------
-    rows : the rows of each frame; each has the columns that its method has
-    scans : sums of each scan: `COUNTS` in each convention with its key before them as in
-        ``groundgrid_tp``, of `metrics.height_sums`, `OBJECT_COUNTS`, shares; seconds, pose, fit
-    rings : `COUNTS` of each ring of a scan, in the convention that counts
+    scans : sums of each scan: `COUNTS`, of `metrics.height_sums`, `OBJECT_COUNTS`, shares;
+        seconds, pose, fit; a column that a method does not have is NaN in its rows
+    rings : `COUNTS` of each ring of a scan
     bins : `metrics.count_bins` of each scan
     objects : `OBJECT_COUNTS` of each scan, by class and band
     times : seconds of each stage, of methods that report them
     """
 
-    rows: Rows
     scans: DataFrame
     rings: DataFrame
     bins: DataFrame
@@ -293,63 +284,42 @@ class Scores(NamedTuple):
     @property
     def methods(self) -> list[str]:
         """Names of the methods, in order."""
-        return list(dict.fromkeys(row['method'] for row in self.rows['scans']))
+        return list(self.scans['method'].unique())
 
     @property
     def sequences(self) -> list[str]:
         """Names of the sequences, in order."""
-        return list(dict.fromkeys(row['sequence'] for row in self.rows['scans']))
+        return list(self.scans['sequence'].unique())
 
     @property
-    def conventions(self) -> list[str]:
-        """Keys of the conventions, the one that counts first; none without labels."""
-        return [name.removesuffix('_tp') for name in self.scans if name.endswith('_tp')]
+    def has_truth(self) -> bool:
+        """Whether the scans are labelled."""
+        return 'tp' in self.scans
 
-    def of(
-        self, methods: Collection[str] | None = None, sequences: Collection[str] | None = None
-    ) -> Scores:
-        """Return the part of some methods and sequences, by default of all."""
-        return make_scores([{
-            name: [
-                row for row in rows
-                if (methods is None or row['method'] in methods)
-                and (sequences is None or row['sequence'] in sequences)
-            ]
-            for name, rows in self.rows.items()
-        }])  # fmt: skip
+    def of(self, sequences: Iterable[str]) -> Scores:
+        """Return the part of some sequences."""
+        names = [*sequences]
+        return Scores(*(frame[frame['sequence'].isin(names)] for frame in self))
 
 
 def make_scores(parts: Iterable[Rows]) -> Scores:
     """Make frames of rows, in the order of the methods."""
-    pandas, parts = require_pandas(), [*parts]
+    parts = [*parts]
     rows = {name: [row for part in parts for row in part.get(name, ())] for name in COLUMNS}
     methods = list(dict.fromkeys(row['method'] for row in rows['scans']))
     for own in rows.values():
         own.sort(key=lambda row: methods.index(row['method']))
-    frames = (
-        # Without a row pandas knows no type, and sums up no column.
-        pandas.DataFrame(own) if own else pandas.DataFrame(columns=[*COLUMNS[name]], dtype=float)
-        for name, own in rows.items()
-    )
-    return Scores(rows, *frames)
-
-
-def require_pandas() -> Any:
-    """Import pandas, or raise a MissingDependencyError."""
-    return require('pandas', 'pandas')
+    return Scores(*(frame_of(own, COLUMNS[name]) for name, own in rows.items()))
 
 
 def with_all(frame: DataFrame, column: str = 'sequence') -> DataFrame:
     """Return the rows, and below them each once more in the group `ALL` of a column."""
-    concat = require_pandas().concat
-    return concat([frame, frame.assign(**{column: ALL})], ignore_index=True)
+    found: DataFrame = require_pandas().concat(
+        [frame, frame.assign(**{column: ALL})], ignore_index=True
+    )
+    return found
 
 
 def sums(frame: DataFrame, *by: str) -> DataFrame:
     """Sum up the rows of each method, or of each group in it, in the order of the rows."""
     return frame.groupby(['method', *by], sort=False).sum(numeric_only=True)
-
-
-def each(found: DataFrame, methods: Sequence[str]) -> list[DataFrame]:
-    """Return the part of each method of what is grouped by methods first."""
-    return [found.loc[method] for method in methods]

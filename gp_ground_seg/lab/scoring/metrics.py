@@ -1,16 +1,15 @@
-"""Conventions of ground; labels, probabilities and heights against the truth, as sums.
+"""Labels, probabilities and heights of a scan against the truth, as sums; ratios of sums.
 
-Sums add up over scans. A `Measure` is a ratio of sums by name: of one scan, or of a frame of
-pandas, whose rows are scans or groups of them. Ratios over nothing are NaN.
+Sums add up over scans. A measure is a function of sums by name: of a mapping of numbers, or of a
+frame of pandas, whose rows are scans or groups of them. Ratios over nothing are NaN.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -43,50 +42,17 @@ BIN_EDGES = np.linspace(0.0, 1.0, 16)
 """Edges of the bins of probability in the expected calibration error."""
 N_BINS = len(BIN_EDGES) - 1
 
-SENSOR_HEIGHT = 1.73
-"""Height of the sensor [m] in SemanticKITTI. The truth is a property of the data:
-it must not move with ``sensor.height``, which is a parameter of the method."""
-LOW_VEGETATION_Z = -0.75 * SENSOR_HEIGHT
-"""Height [m, sensor frame] below which Patchwork's evaluation counts vegetation as ground."""
 
+def true_labels(semantic: npt.NDArray[np.integer]) -> Labels:
+    """Return the true `Label` (N,) by SemanticKITTI class; UNKNOWN does not count.
 
-@dataclass(frozen=True)
-class Convention:
-    """A way to read semantic classes as ground and not ground."""
-
-    key: str  # in files
-    title: str  # in tables
-    rule: str
-    left_out: tuple[int, ...]  # classes whose points do not count
-    low_vegetation_z: float = -math.inf  # below it vegetation is ground [m, sensor frame]
-
-    def truth(self, semantic: npt.NDArray[np.integer], z: npt.NDArray[np.floating]) -> Labels:
-        """Return the true `Label` (N,) by class and height (N,); UNKNOWN does not count."""
-        ground = np.isin(semantic, GROUND_CLASSES)
-        ground |= (semantic == VEGETATION) & (z < self.low_vegetation_z)
-        truth = np.where(ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
-        truth[np.isin(semantic, self.left_out)] = Label.UNKNOWN
-        return truth
-
-
-GROUNDGRID = Convention(
-    'groundgrid', 'GroundGrid', 'vegetation left out', (UNLABELLED, OUTLIER, VEGETATION)
-)
-"""Steinke et al., "GroundGrid: LiDAR Point Cloud Ground Segmentation and Terrain Estimation",
-RA-L 2024. Our headline."""
-
-PATCHWORK = Convention(
-    'patchwork',
-    'Patchwork',
-    f'vegetation below {LOW_VEGETATION_Z:.2f} m is ground, above it an obstacle',
-    (UNLABELLED, OUTLIER),
-    LOW_VEGETATION_Z,
-)
-"""Lim et al., "Patchwork: Concentric Zone-Based Region-Wise Ground Segmentation With Ground
-Likelihood Estimation Using a 3D LiDAR Sensor", RA-L 2021. The threshold, -3/4 of the sensor's
-height, is that of its published evaluation code."""
-
-CONVENTIONS = (GROUNDGRID, PATCHWORK)
+    Vegetation is left out, as by Steinke et al., "GroundGrid: LiDAR Point Cloud Ground
+    Segmentation and Terrain Estimation", RA-L 2024.
+    """
+    is_ground = np.isin(semantic, GROUND_CLASSES)
+    truth = np.where(is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
+    truth[np.isin(semantic, (UNLABELLED, OUTLIER, VEGETATION))] = Label.UNKNOWN
+    return truth
 
 
 def ratio(part: Any, whole: Any) -> Any:
@@ -95,55 +61,42 @@ def ratio(part: Any, whole: Any) -> Any:
         return np.true_divide(part * (whole != 0), whole)
 
 
-class Measure(NamedTuple):
-    """A ratio of two sums, each of some columns, or the root of it."""
-
-    above: tuple[str, ...]
-    below: tuple[str, ...]
-    is_root: bool = False
-
-    def of(self, sums: Any) -> Any:
-        """Return it of sums by name: of numbers, or of the rows of a frame."""
-        value = ratio(*(sum(sums[name] for name in names) for names in self[:2]))
-        return np.sqrt(value) if self.is_root else value
-
-    def prefixed(self, prefix: str) -> Measure:
-        """Return it of columns whose names have a prefix."""
-        above, below = (tuple(f'{prefix}{name}' for name in names) for names in self[:2])
-        return Measure(above, below, self.is_root)
+Measure = Callable[[Any], Any]
+"""A function of sums by name."""
 
 
-LABEL_MEASURES = {
-    'precision': Measure(('tp',), ('tp', 'fp')),
-    'recall': Measure(('tp',), ('tp', 'fn')),
-    'f1': Measure(('tp', 'tp'), ('tp', 'tp', 'fp', 'fn')),
-    'accuracy': Measure(('tp', 'tn'), COUNTS),
-    'iou': Measure(('tp',), ('tp', 'fp', 'fn')),
+def share(part: str, whole: str) -> Measure:
+    """Return the measure that divides one sum by another."""
+    return lambda sums: ratio(sums[part], sums[whole])
+
+
+LABEL_MEASURES: dict[str, Measure] = {
+    'precision': lambda s: ratio(s['tp'], s['tp'] + s['fp']),
+    'recall': lambda s: ratio(s['tp'], s['tp'] + s['fn']),
+    'f1': lambda s: ratio(s['tp'] + s['tp'], s['tp'] + s['tp'] + s['fp'] + s['fn']),
+    'accuracy': lambda s: ratio(s['tp'] + s['tn'], s['tp'] + s['fp'] + s['fn'] + s['tn']),
+    'iou': lambda s: ratio(s['tp'], s['tp'] + s['fp'] + s['fn']),
 }
 """Measures of `COUNTS`."""
-HEIGHT_MEASURES = {
-    'rmse': Measure(('square',), ('n_points',), is_root=True),
-    'bias': Measure(('error',), ('n_points',)),
-    'smse': Measure(('square',), ('deviation',)),
-    'within_1': Measure(('n_within_1',), ('n_with_std',)),
-    'within_2': Measure(('n_within_2',), ('n_with_std',)),
+HEIGHT_MEASURES: dict[str, Measure] = {
+    'without_model': lambda s: ratio(s['n_without_model'], s['n_points'] + s['n_without_model']),
+    'bias': share('error', 'n_points'),
+    'rmse': lambda s: np.sqrt(ratio(s['square'], s['n_points'])),
+    'smse': share('square', 'deviation'),
+    'within_1': share('n_within_1', 'n_with_std'),
+    'within_2': share('n_within_2', 'n_with_std'),
 }
 """Measures of `height_sums`; lengths in metres.
 
-RMSE; bias, the mean error; the standardised mean squared error, mean((y - mu)^2) / var(y)
-(paper, section IV); the shares within one and two standard deviations, of a normal distribution
-0.683 and 0.954.
+The share of the points under which the surface has no height; bias, the mean error; RMSE; the
+standardised mean squared error, mean((y - mu)^2) / var(y) (paper, section IV); the shares within
+one and two standard deviations, of a normal distribution 0.683 and 0.954.
 """
 
 
-def label_ratios(sums: Any, prefix: str = '') -> dict[str, Any]:
-    """Return `LABEL_MEASURES` of sums whose names have the `prefix`, by name."""
-    return {name: measure.prefixed(prefix).of(sums) for name, measure in LABEL_MEASURES.items()}
-
-
-def height_ratios(sums: Any) -> dict[str, Any]:
-    """Return `HEIGHT_MEASURES` of sums, by name."""
-    return {name: measure.of(sums) for name, measure in HEIGHT_MEASURES.items()}
+def label_ratios(sums: Any) -> dict[str, Any]:
+    """Return `LABEL_MEASURES` of sums, by name."""
+    return {name: measure(sums) for name, measure in LABEL_MEASURES.items()}
 
 
 def count_labels(label: Labels, truth: Labels) -> dict[str, int]:
@@ -162,11 +115,13 @@ def count_rings(
 
     The last one, `NO_RING`, has the points without a finite range.
     """
-    titles = [*RING_TITLES, NO_RING]
-    counts = _counts(label, truth, ring_of(points), len(titles)).tolist()
+    x, y = points[:, :2].astype(np.float64).T
+    reach = np.hypot(x, y)
+    ring = np.where(np.isfinite(reach), np.digitize(reach, RING_EDGES[1:-1]), len(RING_TITLES))
+    counts = _counts(label, truth, ring, len(RING_TITLES) + 1).tolist()
     return [
         {'range': title, **dict(zip(COUNTS, own, strict=True))}
-        for title, own in zip(titles, counts, strict=True)
+        for title, own in zip([*RING_TITLES, NO_RING], counts, strict=True)
     ]
 
 
@@ -176,17 +131,6 @@ def _counts(label: Labels, truth: Labels, group: IntArray, n_groups: int) -> Int
     code = 4 * group + 2 * (label != Label.GROUND) + (truth != Label.GROUND)
     # In the order of the codes: true and false positives, false and true negatives.
     return np.bincount(code[scored], minlength=4 * n_groups).reshape(n_groups, 4)
-
-
-def ring_of(points: npt.NDArray[np.floating]) -> npt.NDArray[np.intp]:
-    """Index of the ring that each of the points (N, >=2) is in, (N,).
-
-    A point without a finite range has the index after the last one.
-    """
-    x, y = points[:, :2].astype(np.float64).T
-    reach = np.hypot(x, y)
-    ring: npt.NDArray[np.intp] = np.digitize(reach, RING_EDGES[1:-1])
-    return np.where(np.isfinite(reach), ring, len(RING_TITLES))
 
 
 def check_lengths(n_points: int, **values: Any) -> None:
@@ -237,9 +181,9 @@ def height_sums(
 ) -> dict[str, Any]:
     """Compare true with estimated heights of the ground in a frame, (n,) [m].
 
-    Points whose estimate is NaN, as there is no model, are in `n_without_model` only. `std` are
-    the standard deviations of the differences, (n,) [m], if there are any. The error is estimate
-    minus truth; `deviation` is of the truth from its mean. `median_absolute` is no sum.
+    Points whose estimate is NaN, because there is no model, are in `n_without_model` only. `std`
+    are the standard deviations of the differences, (n,) [m], if there are any. The error is
+    estimate minus truth; `deviation` is of the truth from its mean. `median_absolute` is no sum.
     """
     known = np.isfinite(estimate)
     y = truth[known].astype(np.float64)

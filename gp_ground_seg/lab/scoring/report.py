@@ -1,164 +1,120 @@
-"""Results: tables for the terminal, as Markdown and JSON; machine, versions and parameters."""
+"""Results: frames of pandas as tables and JSON; machine, versions and parameters of a run."""
 
 from __future__ import annotations
 
 import json
-import math
 import os
 import platform
 import subprocess
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gp_ground_seg
+from gp_ground_seg.core.errors import require
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.parameters.schema import ParameterValue
 from gp_ground_seg.data.files import write_file
 from gp_ground_seg.lab.cluster import package_versions
 
+if TYPE_CHECKING:
+    from pandas import DataFrame, Series
+
 WIDTH = 100
 """Columns of the terminal that titles and notes are folded to."""
+PEER = 'peer_'
+"""Beginning of the names of columns of the other method."""
 
-Cell = str | int | float | None
-"""Content of a cell; None and NaN are shown as ``-``."""
 
+class Form(NamedTuple):
+    """How a column is shown: its title, the format of its numbers, and the factor before it.
 
-@dataclass(frozen=True)
-class Column:
-    """A column of a table.
-
-    `format` is that of its numbers, such as ``.2f``; ``_d`` separates thousands by spaces.
-    Without one the column holds text and is aligned left. `key` is its name in JSON, the title
-    by default, `scale` the factor between what a cell holds and what is shown. Where the rows
-    have units of their own, format and scale are tuples, with an entry for each row.
+    Without a format the column holds text. The factor may be one for each row.
     """
 
     title: str
-    format: str | tuple[str, ...] = ''
-    key: str = ''
-    scale: float | tuple[float, ...] = 1
-
-    def show(self, value: Cell, row: int = 0) -> str:
-        """Return a cell of a row as it is shown."""
-        if isinstance(value, str):
-            return value
-        if value is None or math.isnan(value):
-            return '-'
-        form = self.format if isinstance(self.format, str) else self.format[row]
-        scale = self.scale if isinstance(self.scale, int | float) else self.scale[row]
-        number = round(scale * value) if form.endswith('d') else scale * value
-        return format(number, form).replace('_', ' ')
-
-    def plain(self, value: Any) -> Cell:
-        """Return a cell as it is in JSON: a number is one of Python, and not scaled."""
-        if value is None or isinstance(value, str):
-            return value
-        if math.isnan(value):
-            return None
-        return int(value) if str(self.format).endswith('d') else float(value)
+    format: str = ''
+    scale: float | Sequence[float] = 1.0
 
 
-def percent(title: str, key: str = '', form: str = '.2f') -> Column:
-    """Column of ratios, shown in percent."""
-    return Column(title, form, key, 100.0)
+class Table(NamedTuple):
+    """A frame of unscaled numbers and text, whose columns have the names that JSON has.
 
-
-def centimetres(title: str, key: str = '') -> Column:
-    """Column of lengths in metres, shown in centimetres."""
-    return Column(title, '.2f', key, 100.0)
-
-
-def milliseconds(title: str, key: str = '') -> Column:
-    """Column of times in seconds, shown in milliseconds."""
-    return Column(title, '.1f', key, 1e3)
-
-
-@dataclass(frozen=True)
-class Table:
-    """Columns of unscaled numbers and text, such as those of a frame of pandas.
-
-    The title stands above it, notes below; `n_sums` rows at the end are set apart in `text`.
+    A column that is not in `forms` is text under its name, and one of the other method has the
+    form of ours.
     """
 
-    columns: Mapping[Column, Iterable[Any]]
-    title: str = ''
+    title: str
+    frame: DataFrame
+    forms: Mapping[str, Form] = {}
     notes: Sequence[str] = ()
-    n_sums: int = 0
+
+    def shown(self) -> DataFrame:
+        """Return the cells as text, under their titles; ``-`` is none."""
+        forms = [self._form(name) for name in self.frame]
+        cells = self.frame.reset_index(drop=True).astype(object)
+        for name, form in zip(cells, forms, strict=True):
+            cells[name] = _text(cells[name], form)
+        return cells.set_axis([form.title for form in forms], axis='columns')
+
+    def _form(self, name: str) -> Form:
+        """Return the form of a column, which has that of ours if it has none of its own."""
+        form = self.forms.get(name)
+        if form is None and name.startswith(PEER):
+            ours = self._form(name.removeprefix(PEER))
+            return ours._replace(title=f'peer {ours.title}')
+        return form or Form(name)
 
     def text(self) -> str:
-        """Return aligned text, columns two spaces apart; of no rows neither titles."""
-        above = [fold(self.title)] if self.title else []
-        below = ['', *map(fold, self.notes)] if self.notes else []
-        return '\n'.join([*above, *self._lines(), *below])
-
-    def _lines(self) -> list[str]:
-        lines = self._shown()
-        if len(lines) == 1:
-            return []
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        marks = ['>' if column.format else '<' for column in self.columns]
-        form = '  '.join(f'{{:{mark}{w}}}' for mark, w in zip(marks, widths, strict=True))
-        text = [form.format(*line).rstrip() for line in lines]
-        rule = '-' * (sum(widths) + 2 * (len(widths) - 1))
-        if self.n_sums:
-            text.insert(len(text) - self.n_sums, rule)
-        text.insert(1, rule)
-        return text
+        """Return title, aligned cells and notes for the terminal."""
+        cells = self.shown()
+        table = [cells.to_string(index=False)] if len(cells) else []
+        return '\n'.join([fold(self.title), *table, *map(fold, self.notes)])
 
     def markdown(self) -> str:
         """Return a Markdown table, title and notes as paragraphs."""
-        titles, *rows = self._shown()
-        rule = ['--:' if column.format else '---' for column in self.columns]
-        table = '\n'.join(f'| {" | ".join(line)} |' for line in [titles, rule, *rows])
-        return '\n\n'.join([*([self.title] if self.title else []), table, *self.notes])
+        sides = ['right' if self._form(name).format else 'left' for name in self.frame]
+        table = self.shown().to_markdown(index=False, disable_numparse=True, colalign=sides)
+        return '\n\n'.join([self.title, table, *self.notes])
 
     def json(self) -> list[dict[str, Any]]:
         """Return one object per row, unscaled."""
-        keys = [column.key or column.title for column in self.columns]
-        cells = ([column.plain(cell) for cell in own] for column, own in self.columns.items())
-        return [dict(zip(keys, row, strict=True)) for row in zip(*cells, strict=True)]
+        return records(self.frame)
 
-    def _shown(self) -> list[list[str]]:
-        """Titles and rows, every cell as it is shown."""
-        shown = (
-            [column.title, *(column.show(cell, row) for row, cell in enumerate(cells))]
-            for column, cells in self.columns.items()
-        )
-        return [list(line) for line in zip(*shown, strict=True)]
+
+def frame_of(rows: Any, columns: Sequence[str] | None = None) -> DataFrame:
+    """Return a frame of rows or of columns by name, or an empty one of the `columns`."""
+    pandas = require_pandas()
+    # Without a row pandas knows no type, and sums up no column.
+    return pandas.DataFrame(rows) if rows else pandas.DataFrame(columns=columns, dtype=float)
+
+
+def require_pandas() -> Any:
+    """Import pandas, or raise a MissingDependencyError."""
+    return require('pandas', 'pandas tabulate')
+
+
+def _text(values: Series, form: Form) -> list[str]:
+    """Return the cells of a column as they are shown, thousands set apart by a blank."""
+    if not form.format:
+        shown = [str(value) for value in values]
+    else:
+        scaled = values.astype(float) * form.scale
+        shown = [f'{value:{form.format}}'.replace(',', ' ') for value in scaled]
+    return ['-' if gone else cell for cell, gone in zip(shown, values.isna(), strict=True)]
+
+
+def records(frame: DataFrame) -> list[dict[str, Any]]:
+    """Return the rows with values of Python, None for NaN."""
+    found: list[dict[str, Any]] = (
+        frame.astype(object).where(frame.notna(), None).to_dict('records')
+    )
+    return found
 
 
 def fold(line: str) -> str:
     """Fold a line for the terminal."""
     return textwrap.fill(line, WIDTH, subsequent_indent='  ', break_on_hyphens=False)
-
-
-def written(tables: Iterable[Table], lines: Sequence[str], *, markdown: bool) -> str:
-    """Tables, and below them lines on the run, for the terminal or as Markdown."""
-    shown = [table.markdown() if markdown else table.text() for table in tables]
-    below = [*lines] if markdown else ['\n'.join(map(fold, lines))]
-    return '\n\n'.join([*shown, *below])
-
-
-def _plain(value: Any) -> Any:
-    """Nested mappings and sequences with numbers of Python, NaN as None: JSON has no NaN."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
-
-
-def write_json(document: Any, path: str | Path) -> None:
-    """Write a document as JSON, NaN as null."""
-    text = json.dumps(_plain(document), indent=2, allow_nan=False) + '\n'
-    write_file(Path(path), text.encode())
 
 
 def describe_environment(*packages: str) -> dict[str, Any]:
@@ -190,12 +146,12 @@ def machine_line(environment: Mapping[str, Any], backend: str = '') -> str:
     return f'{machine}, commit {commit[:12]}{" (changed since)" if dirty else ""}'
 
 
-def changed_parameters(config: Config) -> dict[str, ParameterValue]:
+def changed_parameters(config: Config) -> dict[str, Any]:
     """Parameters that differ from their defaults, by dotted name."""
     return {spec.name: value for spec, _, value in Config().differences(config)}
 
 
-def parameters_line(changes: dict[str, ParameterValue]) -> str:
+def parameters_line(changes: Mapping[str, Any]) -> str:
     """One line on the parameters of a run."""
     words = ', '.join(f'{name}={value}' for name, value in changes.items())
     return f'parameters: {words or "defaults"}'
@@ -231,12 +187,18 @@ def _git(folder: Path, *words: str) -> str | None:
 
 
 class Report(NamedTuple):
-    """Tables to show, every number by scan or segment, backend, further facts."""
+    """Tables to show, every number by scan or segment, the backend, and further facts."""
 
     tables: dict[str, Table]
     rows: list[dict[str, Any]]
     backend: str
     facts: dict[str, Any]
+
+    def text(self, machine: str, *, markdown: bool) -> str:
+        """Return the tables, and below them the line on the machine."""
+        tables = self.tables.values()
+        shown = [table.markdown() if markdown else table.text() for table in tables]
+        return '\n\n'.join([*shown, machine if markdown else fold(machine)])
 
     def write(self, path: Path, environment: dict[str, Any]) -> None:
         """Write every number as JSON."""
@@ -247,4 +209,4 @@ class Report(NamedTuple):
             **{name: table.json() for name, table in self.tables.items()},
             'rows': self.rows,
         }
-        write_json(document, path)
+        write_file(path, (json.dumps(document, indent=2, allow_nan=False) + '\n').encode())

@@ -1,361 +1,372 @@
-"""Tables of an evaluation, and the numbers of each scan; ours is the first of the methods."""
+"""Tables of an evaluation: measures of ours beside one other method, with intervals.
+
+The interval of a difference is a bootstrap over sequences (Efron and Tibshirani, "An Introduction
+to the Bootstrap", 1993): the frames of a sequence show the same street and are not independent,
+so a sequence is drawn as a whole. Six sequences are few: the interval is rough, and rather too
+narrow than too wide.
+"""
 
 from __future__ import annotations
 
-import dataclasses
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.lab.scoring import metrics, objects, report
-from gp_ground_seg.lab.scoring.comparison import (
-    INTERVAL,
-    difference_table,
-    interval_note,
-    interval_text,
-    iou_measure,
-    without_one_table,
-)
-from gp_ground_seg.lab.scoring.evaluate import (
-    ALL,
-    FIT,
-    KEYS,
-    POSE,
-    Scores,
-    each,
-    sums,
-    title_of,
-    with_all,
-)
-from gp_ground_seg.lab.scoring.metrics import Measure, height_ratios, label_ratios, ratio
+from gp_ground_seg.lab.scoring import metrics, objects
+from gp_ground_seg.lab.scoring.evaluate import ALL, KEYS, Scores, sums, title_of, with_all
+from gp_ground_seg.lab.scoring.metrics import COUNTS, Measure, ratio, share
 from gp_ground_seg.lab.scoring.report import (
-    Column,
+    PEER,
+    Form,
     Report,
     Table,
-    centimetres,
-    milliseconds,
-    percent,
+    changed_parameters,
+    frame_of,
+    records,
 )
 
 if TYPE_CHECKING:
-    from pandas import DataFrame, Series
+    from pandas import DataFrame
 
-RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
-SHARE_TITLES = {
-    objects.LOW_THINGS: ('low returns', percent('as ground')),
-    'road_cells': ('road cells', percent('false', form='.3f')),
-    'ground_cells': ('ground cells', percent('false', form='.3f')),
+CONFIDENCE, N_DRAWS, SEED = 0.95, 10_000, 0
+N_BLOCKS, MIN_BLOCK = 10, 5
+"""Most blocks of a single sequence, and the least number of frames in each."""
+FEW = 20
+"""Below this number of clusters an interval is said to be rough."""
+N_NAMED = 3
+"""Frames that are named because they differ most."""
+
+MEASURES: dict[str, Measure] = {
+    **metrics.LABEL_MEASURES,
+    'share_ground': share('n_ground', 'n_returns'),
+    'share_lost': share('n_lost', 'n_objects'),
+    **{name: share(f'{name}_wrong', f'{name}_n') for name in objects.SHARES},
+    **metrics.HEIGHT_MEASURES,
+    'seconds': share('seconds', 'n_scans'),
 }
-"""Columns of `scoring.objects.SHARES`: of what is counted, and of what of it is wrong."""
+"""What is measured of sums over scans."""
+IOU, RMSE = MEASURES['iou'], MEASURES['rmse']
+HEIGHTS = 'without_model', 'bias', 'rmse', 'median_absolute', 'within_1', 'within_2'
+"""Measures of the heights that are shown."""
+SHARE, SIGNED, COUNT = ('.2f', 100.0), ('+.2f', 100.0), (',.0f',)
+"""Formats and factors: of ratios in percent, and of metres in cm; of their differences; counts."""
+FORMS = {
+    'n_scans': Form('frames', *COUNT),
+    'points': Form('points', *COUNT),
+    'precision': Form('precision', *SHARE),
+    'recall': Form('recall', *SHARE),
+    'f1': Form('F1', *SHARE),
+    'accuracy': Form('accuracy', *SHARE),
+    'iou': Form('IoU', *SHARE),
+    'difference': Form('difference', *SIGNED),
+    'interval': Form('95 % interval'),
+    'errors': Form('errors', *COUNT),
+    'share_of_errors': Form('of errors', *SHARE),
+    'n_returns': Form('returns', *COUNT),
+    'share_ground': Form('as ground', *SHARE),
+    'n_unknown': Form('no ground near', *COUNT),
+    'n_objects': Form('objects', *COUNT),
+    'n_lost': Form('lost', *COUNT),
+    'low_things_n': Form('low returns', *COUNT),
+    'low_things': Form('as ground', *SHARE),
+    'road_cells_n': Form('road cells', *COUNT),
+    'road_cells': Form('false', '.3f', 100.0),
+    'ground_cells_n': Form('ground cells', *COUNT),
+    'ground_cells': Form('false', '.3f', 100.0),
+    'n_points': Form('points', *COUNT),
+    'without_model': Form('no model', *SHARE),
+    'bias': Form('bias', *SHARE),
+    'rmse': Form('RMSE', *SHARE),
+    'median_absolute': Form('median', *SHARE),
+    'within_1': Form('in 1 std', '.1f', 100.0),
+    'within_2': Form('in 2 std', '.1f', 100.0),
+    'ece': Form('ECE', '.4f'),
+    'median': Form('median', '.1f', 1e3),
+    'mean': Form('mean', '.1f', 1e3),
+    'ratio': Form('ours / this', '.2f'),
+}
+"""How columns are shown, by their name in JSON."""
+COMPARED = {
+    'iou': 'IoU [%]',
+    'precision': 'precision [%]',
+    'recall': 'recall [%]',
+    'share_ground': 'returns on objects called ground [%]',
+    'share_lost': 'objects lost [%]',
+    **{name: f'{title} [%]' for name, title in objects.SHARES.items()},
+    'rmse': 'RMSE of the height [cm]',
+    'within_1': 'heights within 1 std, ideally 68.3 [%]',
+    'within_2': 'heights within 2 std, ideally 95.4 [%]',
+    'seconds': 'time per frame, mean [ms]',
+}
+"""Measures of which the differences have an interval."""
 
 
-def evaluation(
-    scores: Scores, config: Config, n_workers: int = 0, cut: float = objects.CUT_HEIGHT
-) -> Report:
-    """Report of our method with `config`, and of at most one other method on the same scans.
+def clusters(scores: Scores) -> DataFrame:
+    """Return sequence, index and cluster of each scan; of one cluster, blocks of scans."""
+    scans = scores.scans
+    found = scans.loc[scans['method'] == scores.methods[0], [*KEYS[1:], 'cluster']]
+    if found['cluster'].nunique() > 1:
+        return found
+    n = len(found)
+    n_blocks = max(min(N_BLOCKS, n // MIN_BLOCK), 1)
+    ends = [n * k // n_blocks for k in range(1, n_blocks)]
+    return found.assign(cluster=np.searchsorted(ends, np.arange(n), side='right'))
 
-    Scans without labels have tables of time and of differing labels only. `cut` is the height at
-    which objects were cut [m].
+
+def difference_interval(
+    scores: Scores,
+    other: str,
+    measure: Measure,
+    frame: DataFrame | None = None,
+    ours: str = '',
+) -> tuple[float, float] | None:
+    """Interval of a measure of ours, by default the first method, minus that of another.
+
+    It is of the pooled scans, or of the rows of another `frame` of the scores. None with fewer
+    than two clusters, or where a ratio is over nothing. It draws in the same way each time.
     """
-    tables: dict[str, Table] = {}
-    has_labels = bool(scores.conventions)
-    if has_labels:
-        tables |= {rule.key: _convention_table(scores, rule) for rule in metrics.CONVENTIONS}
-    for other in scores.methods[1:]:
-        if has_labels:
-            tables['differences'] = _iou_differences(scores, other)
-        if has_labels and len(scores.sequences) > 2:
-            tables['without_one'] = without_one_table(scores, other)
-        tables['measures'] = difference_table(scores, other)
-    if has_labels:
-        tables['rings'] = _ring_table(scores)
-        tables['objects'] = object_table(scores)
-        tables['low_things'] = _share_table(scores, cut)
-        tables['probabilities'] = _calibration_table(scores)
-        tables['heights'] = _height_table(scores)
-    tables['times'] = _time_table(scores, n_workers)
-    stages = {name: median_stages(scores, name) for name in scores.methods}
-    reliability = reliability_rows(scores)
-    return make_report(tables, scores, config, reliability=reliability, stages=stages)
+    of_scan = clusters(scores)
+    names = of_scan['cluster'].unique()
+    n = len(names)
+    if n < 2:
+        return None
+    times_drawn = np.random.default_rng(SEED).multinomial(n, np.full(n, 1.0 / n), size=N_DRAWS)
+    rows = (scores.scans if frame is None else frame).drop(columns='cluster', errors='ignore')
+    parts = sums(rows.merge(of_scan, on=[*KEYS[1:]]), 'cluster')
+
+    def drawn(method: str) -> Any:
+        part = parts.loc[method].reindex(names, fill_value=0)
+        pooled = times_drawn @ part.to_numpy(dtype=np.float64)
+        return measure(dict(zip(part, pooled.T, strict=True)))
+
+    difference = drawn(ours or scores.methods[0]) - drawn(other)
+    if np.isnan(difference).any():
+        return None
+    tail = 0.5 * (1.0 - CONFIDENCE)
+    low, high = np.quantile(difference, [tail, 1.0 - tail]).tolist()
+    return low, high
 
 
-def make_report(tables: dict[str, Table], scores: Scores, base: Config, **facts: Any) -> Report:
-    """Report of scored variants; `base` is what they change, the first is of our method."""
-    given = {'config_changes': report.changed_parameters(base), 'config': base.nested()}
-    return Report(
-        tables, scan_rows(scores), scores.rows['scans'][0]['backend'], {**given, **facts}
-    )
+def interval_text(
+    scores: Scores,
+    other: str,
+    measure: Measure,
+    frame: DataFrame | None = None,
+    ours: str = '',
+    scale: float = 100.0,
+) -> str | None:
+    """`difference_interval` times `scale`, as in ``-0.10 to +0.25 tie``; None without one."""
+    found = difference_interval(scores, other, measure, frame, ours)
+    if found is None:
+        return None
+    low, high = found
+    return f'{scale * low:+.2f} to {scale * high:+.2f}' + ' tie' * (low <= 0.0 <= high)
 
 
-def scan_rows(scores: Scores) -> list[dict[str, Any]]:
-    """Every number of each scan of each method; heights in metres, angles in radians."""
-    bins, counts_of = (
-        dict(iter(frame.groupby([*KEYS], sort=False))) for frame in (scores.bins, scores.objects)
-    )
-    heights = 'n_points', 'n_without_model', 'median_absolute'
-    kept = *KEYS, 'seconds', 'points', 'n_changed', *FIT, *(f'sensor_{name}' for name in POSE)
-    rows = []
-    for own in scores.rows['scans']:
-        key = tuple(own[name] for name in KEYS)
-        row = {name: own[name] for name in kept if name in own}
-        for convention in scores.conventions:
-            counts = {name: own[f'{convention}_{name}'] for name in metrics.COUNTS}
-            found = counts | label_ratios(counts)
-            row |= {f'{convention}_{name}': value for name, value in found.items()}
-        if own.get('n_points'):
-            found = {name: own[name] for name in heights} | height_ratios(own)
-            row |= {f'{name}_all': value for name, value in found.items()}
-        if key in bins and bins[key]['n'].any():
-            row['ece'] = metrics.calibration_error(bins[key])
-        for name in objects.SHARES:
-            if f'{name}_n' in own:
-                row[name] = {'n': own[f'{name}_n'], 'n_wrong': own[f'{name}_wrong']}
-        if key in counts_of:
-            row['objects'] = {
-                name: part.set_index('range')[[*objects.OBJECT_COUNTS]].to_dict('index')
-                for name, part in counts_of[key].groupby('class', sort=False)
-            }
-        rows.append(row)
-    return rows
+def interval_note(scores: Scores) -> str:
+    """Say what the intervals of differences are, for the title of a table."""
+    names = {*clusters(scores)['cluster']}
+    if (n := len(names)) < 2:
+        return 'no intervals: they need two sequences, or ten frames of one'
+    kind = 'sequences' if names == {*scores.sequences} else 'scenes'
+    if scores.scans['cluster'].nunique() == 1:
+        kind = 'blocks of successive frames'
+    few = ', which are few: rough, and rather too narrow' * (n < FEW)
+    return f'95 % interval: bootstrap over {n} {kind}{few}; tie: it holds 0'
 
 
-def _beside(found: list[Series], methods: list[str]) -> dict[Column, Any]:
-    """Columns of the IoU of the other methods, and of ours minus it."""
-    columns: dict[Column, Any] = {}
-    for name, iou in zip(methods[1:], found[1:], strict=True):
-        columns[percent(f'{title_of(name)} IoU', f'{name}_iou')] = iou
-        columns[percent('difference', f'difference_to_{name}', '+.2f')] = found[0] - iou
-    return columns
+def beside(found: DataFrame, methods: list[str], *compared: str) -> DataFrame:
+    """Return the rows of ours, with each column `compared` of the other method after that of ours.
+
+    `found` has the methods in the first level of its index. If ``iou`` is compared, the last
+    column is the difference. Without another method there is nothing to compare.
+    """
+    ours = found.loc[methods[0]]
+    if not methods[1:]:
+        return ours
+    peer = found.loc[methods[1], [name for name in compared if name in found]].add_prefix(PEER)
+    both = ours.join(peer)
+    both = both[[
+        column for name in ours for column in (name, f'{PEER}{name}') if column in both
+    ]]  # fmt: skip
+    return both.assign(difference=both['iou'] - both['peer_iou']) if 'iou' in compared else both
 
 
-def _convention_table(scores: Scores, convention: metrics.Convention) -> Table:
-    found = each(sums(with_all(scores.scans), 'sequence'), scores.methods)
-    ratios, *others = (label_ratios(own, f'{convention.key}_') for own in found)
-    columns = {
-        Column('sequence'): found[0].index,
-        Column('frames', 'd'): found[0]['n_scans'],
-        **{percent(RATIO_TITLES.get(name, name), name): own for name, own in ratios.items()},
-        **_beside([own['iou'] for own in (ratios, *others)], scores.methods),
-    }
-    title = f'{convention.title} convention: {convention.rule}  [%]'
-    return Table(columns, title, n_sums=1)
+def with_measures(sums: DataFrame) -> DataFrame:
+    """Return sums, and the `MEASURES` that they have."""
+    columns = dict[str, Any]()
+    for name, measure in MEASURES.items():
+        with suppress(KeyError):  # no labels, no heights, no low things
+            columns[name] = measure(sums)
+    return sums.assign(**columns)
 
 
-def _iou_differences(scores: Scores, other: str) -> Table:
-    """Differences of the IoU over all sequences: by convention, and by range."""
-    cases = {
-        f'all, {rule.title} convention': (scores.scans, iou_measure(rule.key))
-        for rule in metrics.CONVENTIONS
-    }
-    for title in metrics.RING_TITLES:
-        cases[title] = scores.rings[scores.rings['range'] == title], iou_measure()
-    found = [measure.of(sums(frame)) for frame, measure in cases.values()]
-    iou, peer = ([own[name] for own in found] for name in (scores.methods[0], other))
-    columns = {
-        Column('points'): cases,
-        percent('IoU', 'iou'): iou,
-        percent(f'{title_of(other)} IoU', 'peer_iou'): peer,
-        percent('difference', form='+.2f'): [a - b for a, b in zip(iou, peer, strict=True)],
-        INTERVAL: [
-            interval_text(scores, other, measure, frame) for frame, measure in cases.values()
-        ],
-    }
-    title = f'IoU minus that of {title_of(other)}  [%]; {interval_note(scores)}'
-    return Table(columns, title)
+def measured(rows: DataFrame, *by: str) -> DataFrame:
+    """Return the sums of each method, or of each group in it, with the `MEASURES` that they have.
 
-
-def _ring_table(scores: Scores) -> Table:
-    every = each(sums(scores.rings, 'range'), scores.methods)
-    n_errors = every[0][['fp', 'fn']].sum().sum()
-    found = [own.loc[[*metrics.RING_TITLES]] for own in every]
-    ratios = [label_ratios(own) for own in found]
-    errors = found[0]['fp'] + found[0]['fn']
-    columns = {
-        Column('range'): found[0].index,
-        Column('points', '_d'): found[0][[*metrics.COUNTS]].sum(axis='columns'),
-        Column('errors', '_d'): errors,
-        percent('of errors', 'share_of_errors'): ratio(errors, n_errors),
-        percent('precision'): ratios[0]['precision'],
-        percent('recall'): ratios[0]['recall'],
-        percent('IoU', 'iou'): ratios[0]['iou'],
-        **_beside([own['iou'] for own in ratios], scores.methods),
-    }
-    return Table(columns, 'Horizontal range (GroundGrid convention)  [%]')
-
-
-def object_table(scores: Scores) -> Table:
-    """Lay out what of objects each method calls ground, by class and range."""
-    rows = with_all(scores.objects, 'range')
-    places = [
-        (name, band) for name in objects.CLASSES if (rows['class'] == name).any()
-        for band in (*objects.BAND_TITLES, ALL)
-    ]  # fmt: skip
-    pooled = sums(rows, 'class', 'range')
-    found = [pooled.loc[[(method, *place) for place in places]] for method in scores.methods]
-    measure = Measure(('n_ground',), ('n_returns',))
-    lost = [own['n_lost'].where(own['n_objects'] > 0) for own in found]
-    columns: dict[Column, Any] = {
-        Column('class'): [name for name, _ in places],
-        Column('range'): [band for _, band in places],
-        Column('returns', '_d'): found[0]['n_returns'],
-        percent('as ground', 'share_ground'): measure.of(found[0]),
-    }
-    title = (
-        f'Objects: returns on them from {objects.MIN_HEIGHT:g} m above the local ground, and the '
-        f'share called ground [%]; objects with at least {objects.MIN_RETURNS} such returns, and '
-        'how many of them are lost: more than half of these returns called ground'
-    )
-    parts = dict(iter(rows.groupby(['class', 'range'])))
-    for peer, own in zip(scores.methods[1:], found[1:], strict=True):
-        columns[percent('peer', f'{peer}_share_ground')] = measure.of(own)
-        columns[INTERVAL] = [interval_text(scores, peer, measure, parts[k]) for k in places]
-        title += f'; peer: {title_of(peer)}; {interval_note(scores)}'
-    columns |= {Column('objects', '_d'): found[0]['n_objects'], Column('lost', '_d'): lost[0]}
-    for peer, count in zip(scores.methods[1:], lost[1:], strict=True):
-        columns[Column('peer lost', '_d', f'{peer}_lost')] = count
-    return Table(columns, title, _object_notes(scores))
-
-
-def _object_notes(scores: Scores) -> list[str]:
-    """Say why objects or returns are missing."""
-    notes = []
-    whole = sums(scores.scans)
-    if not whole[['n_returns', 'n_unknown']].any(axis=None):
-        notes = ['no return on an object: no class of objects in the labels']
-    elif not whole['n_objects'].any():
-        notes = ['no object with enough returns: only classes, if labels have no instances']
-    if n_unknown := whole['n_unknown'].iloc[0]:
-        shown = Column('', '_d').show(n_unknown)
-        notes.append(f'{shown} returns on objects do not count: no labels of the ground near them')
-    return notes
-
-
-def _share_table(scores: Scores, cut: float) -> Table:
-    """Low things and false cells by sequence and pooled, with the columns that ours has."""
-    found = each(sums(with_all(scores.scans), 'sequence'), scores.methods)
-    columns: dict[Column, Any] = {Column('sequence'): found[0].index}
-    for name, (title, column) in SHARE_TITLES.items():
-        if f'{name}_n' in scores.scans:
-            columns[Column(title, '_d', name)] = found[0][f'{name}_n']
-            for method, own in zip(['', *scores.methods[1:]], found, strict=True):
-                key = f'{method}_{name}_wrong'.lstrip('_')
-                title = 'peer' if method else column.title
-                share = ratio(own[f'{name}_wrong'], own[f'{name}_n'])
-                columns[dataclasses.replace(column, title=title, key=key)] = share
-    low = (
-        f'low: returns left of objects that are cut at {cut:g} m, more than '
-        f'{objects.LOW_OVER:g} m over the ground and within {objects.LOW_RANGE:g} m, and the '
-        'share called ground; '
-    )
-    title = (
-        f'Low things and false cells  [%]; {low if cut else ""}cells of {objects.FALSE_SIZE:g} m '
-        f'within {objects.FALSE_RANGE:g} m that hold labelled road or ground, false: a return of '
-        f'it is called obstacle and is {objects.FALSE_OVER:g} m or more over the surface'
-    )
-    title += f'; peer: {title_of(scores.methods[1])}' if scores.methods[1:] else ''
-    return Table(columns, title, n_sums=1)
-
-
-def _calibration_table(scores: Scores) -> Table:
-    """Errors of the probabilities by sequence and pooled."""
-    bins = dict(iter(_bins(scores).groupby('sequence', sort=False)))
-    columns = {
-        Column('sequence'): bins,
-        Column('points', '_d'): [own['n'].sum() for own in bins.values()],
-        Column('ECE', '.4f', 'ece'): [metrics.calibration_error(own) for own in bins.values()],
-    }
-    title = (
-        'Probabilities (GroundGrid convention): expected calibration error over '
-        f'{metrics.N_BINS} bins'
-    )
-    return Table(columns, title, n_sums=1)
-
-
-def _bins(scores: Scores) -> DataFrame:
-    """Sum up the bins of probability of ours, by sequence and pooled."""
-    own = scores.of(scores.methods[:1]).bins
-    return sums(with_all(own), 'sequence', 'bin').reset_index()
-
-
-def reliability_rows(scores: Scores) -> list[dict[str, Any]]:
-    """Share of ground and mean probability in each bin of probability, by sequence and pooled."""
-    if not scores.conventions:
-        return []
-    bins = _bins(scores)
-    columns = {
-        'sequence': bins['sequence'],
-        'from': metrics.BIN_EDGES[bins['bin']],
-        'to': metrics.BIN_EDGES[bins['bin'] + 1],
-        'points': bins['n'],
-        'mean_p': ratio(bins['p'], bins['n']),
-        'share_ground': ratio(bins['n_ground'], bins['n']),
-    }
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-
-
-def _height_table(scores: Scores) -> Table:
-    """Errors of the surface under points labelled ground, by sequence and pooled."""
-    rows = with_all(scores.scans)
-    ours, *others = each(sums(rows, 'sequence'), scores.methods)
-    ratios = height_ratios(ours)
-    medians = rows.groupby(['method', 'sequence'], sort=False)['median_absolute'].median()
-    columns = {
-        Column('sequence'): ours.index,
-        Column('points', '_d'): ours['n_points'],
-        percent('no model', 'share_without_model'): share_without_model(ours),
-        centimetres('bias'): ratios['bias'],
-        centimetres('RMSE', 'rmse'): ratios['rmse'],
-        centimetres('median', 'median_absolute'): medians[scores.methods[0]],
-        percent('in 1 std', 'within_1', '.1f'): ratios['within_1'],
-        percent('in 2 std', 'within_2', '.1f'): ratios['within_2'],
-        **{
-            centimetres(f'{title_of(peer)} RMSE', f'{peer}_rmse'): height_ratios(own)['rmse']
-            for peer, own in zip(scores.methods[1:], others, strict=True)
-        },
-    }
-    title = (
-        'Height of the ground under returns labelled ground, those without a model left out [cm]; '
-        'shares within one and two standard deviations  [%]'
-    )
-    return Table(columns, title, n_sums=1)
-
-
-def share_without_model(found: DataFrame) -> Series:
-    """Share of the points of true ground under which the surface has no height."""
-    return ratio(found['n_without_model'], found['n_points'] + found['n_without_model'])
-
-
-def _time_table(scores: Scores, n_workers: int) -> Table:
-    seconds = scores.scans.groupby('method', sort=False)['seconds']
-    median = seconds.median()
-    columns = {
-        Column('method'): [title_of(name) for name in scores.methods],
-        milliseconds('median'): median,
-        milliseconds('mean'): seconds.mean(),
-        Column('ours / this', '.2f', 'ratio'): median.iloc[0] / median,
-    }
-    times = median_stages(scores, scores.methods[0])
-    stages = ', '.join(f'{name} {1e3 * s:.1f}' for name, s in times.items())
-    words = f'{n_workers} worker' + 's' * (n_workers > 1)
-    beside = f', {words} beside one another' if n_workers else ''
-    title = f'Time per frame, reading left out{beside}  [ms]'
-    return Table(columns, title, [f'stages: {stages}', *_learning_note(scores)])
-
-
-def median_stages(scores: Scores, method: str) -> dict[str, float]:
-    """Median seconds of each stage of a method, empty if it reports none."""
-    own = scores.times[scores.times['method'] == method]
-    found: dict[str, float] = own.drop(columns=[*KEYS]).median().to_dict() if len(own) else {}
+    The median error of the height is that of the scans.
+    """
+    found = with_measures(sums(rows, *by))
+    if 'median_absolute' in rows:
+        groups = rows.groupby(['method', *by], sort=False)
+        found['median_absolute'] = groups['median_absolute'].median()
     return found
 
 
-def _learning_note(scores: Scores) -> list[str]:
-    """Say how many evaluations the learning of ours took, and whether it has converged."""
-    ours = scores.of(scores.methods[:1]).scans
-    learned = ours[ours['n_evaluations'] > 0]
-    if not len(learned):
-        return []
-    numbers, n_converged = learned['n_evaluations'], (learned['status'] == 'converged').sum()
-    return [
-        f'learning: {numbers.median():.0f} evaluations (median), at most '
-        f'{numbers.max():.0f}; {n_converged} of {len(learned)} frames converged'
+def make_report(tables: dict[str, Table], scores: Scores, base: Config, **facts: Any) -> Report:
+    """Report of scored variants; `base` is what they change, the first is of our method.
+
+    Its rows are the scans, with all sums and measures.
+    """
+    stages = scores.times.groupby('method', sort=False).median(numeric_only=True)
+    given = {
+        'config_changes': changed_parameters(base),
+        'config': base.nested(),
+        'stages': stages.to_dict('index'),
+    }
+    backend = str(scores.scans['backend'].iloc[0])
+    return Report(tables, records(with_measures(scores.scans)), backend, {**given, **facts})
+
+
+def peer_note(scores: Scores, note: str = '') -> str:
+    """Say in a title which method the peer is, and more of it."""
+    return ''.join(f'; peer: {title_of(name)}{note}' for name in scores.methods[1:])
+
+
+def evaluation(scores: Scores, config: Config, n_workers: int = 0) -> Report:
+    """Report of our method with `config`, and of at most one other method on the same scans.
+
+    Scans without labels have tables of time and of differing labels only.
+    """
+    tables: dict[str, Table] = {}
+    if scores.has_truth:
+        tables |= _sequence_tables(scores)
+        tables['rings'] = _ring_table(scores)
+    if len(scores.objects):
+        tables['objects'] = _object_table(scores)
+    if scores.methods[1:]:
+        tables['measures'] = difference_table(scores)
+    tables['times'] = _time_table(scores, n_workers)
+    bins = sums(with_all(scores.bins), 'sequence', 'bin').reset_index()
+    return make_report(tables, scores, config, reliability=records(bins))
+
+
+def _sequence_tables(scores: Scores) -> dict[str, Table]:
+    """Labels, shares and heights by sequence and pooled. A further measure is a column here."""
+    rows = with_all(scores.scans)
+    found = measured(rows, 'sequence')
+    bins = sums(with_all(scores.bins), 'sequence', 'bin').groupby(['method', 'sequence'])
+    found['ece'] = bins[['n', 'n_ground', 'p']].apply(metrics.calibration_error)
+    shares = [column for name in objects.SHARES for column in (f'{name}_n', name)]
+    parts = {
+        'groundgrid': (
+            'GroundGrid convention: vegetation left out [%]',
+            ['n_scans', *metrics.LABEL_MEASURES], ['iou'],
+        ),
+        'low_things': (
+            'Low things and false cells [%]',
+            [name for name in shares if name in found], [*objects.SHARES],
+        ),
+        'heights': (
+            'Height of the ground under returns labelled ground [cm]; shares without a model and '
+            'within one and two standard deviations [%]; calibration error of the probabilities',
+            ['n_points', *HEIGHTS, 'ece'], ['rmse'],
+        ),
+    }  # fmt: skip
+    return {
+        name: Table(
+            title + peer_note(scores),
+            beside(found[columns], scores.methods, *compared).reset_index(),
+            FORMS,
+        )
+        for name, (title, columns, compared) in parts.items()
+    }
+
+
+def _ring_table(scores: Scores) -> Table:
+    """Labels by horizontal range, with the intervals of the differences of the IoU."""
+    rows = with_all(scores.rings, 'range')
+    found = measured(rows, 'range')
+    found['points'] = found[[*COUNTS]].sum(axis='columns')
+    found['errors'] = found['fp'] + found['fn']
+    whole = found.loc[(scores.methods[0], ALL), 'errors']
+    found['share_of_errors'] = ratio(found['errors'], whole)
+    found = found[['points', 'errors', 'share_of_errors', 'precision', 'recall', 'iou']]
+    table = beside(found, scores.methods, 'iou').loc[[*metrics.RING_TITLES, ALL]]
+    title = 'IoU'
+    for peer in scores.methods[1:]:
+        parts = dict(iter(rows.groupby('range')))
+        table['interval'] = [interval_text(scores, peer, IOU, parts[band]) for band in table.index]
+        title = f'IoU minus that of {title_of(peer)}, {interval_note(scores)},'
+    title += ' by horizontal range (GroundGrid convention) [%]'
+    return Table(title, table.reset_index(), FORMS)
+
+
+def _object_table(scores: Scores) -> Table:
+    """Lay out what of objects each method calls ground, by class and range."""
+    rows = with_all(scores.objects, 'range')
+    parts = dict(iter(rows.groupby(['class', 'range'])))
+    places = [
+        place for name in objects.CLASSES for band in (*objects.BAND_TITLES, ALL)
+        if (place := (name, band)) in parts
+    ]  # fmt: skip
+    found = measured(rows, 'class', 'range')
+    found['n_lost'] = found['n_lost'].where(found['n_objects'] > 0)
+    found = found[['n_returns', 'share_ground', 'n_objects', 'n_lost', 'n_unknown']]
+    table = beside(found, scores.methods, 'share_ground', 'n_lost').loc[places]
+    title = 'Objects: returns on them, and the share called ground [%]; objects, and those lost'
+    for peer in scores.methods[1:]:
+        ground = MEASURES['share_ground']
+        table['interval'] = [interval_text(scores, peer, ground, parts[k]) for k in places]
+        title += peer_note(scores, f'; of the share as ground: {interval_note(scores)}')
+    return Table(title, table.reset_index(), FORMS)
+
+
+def difference_table(scores: Scores) -> Table:
+    """Compare two methods by `COMPARED`; measures without data in the scans are left out."""
+    other = scores.methods[1]
+    found = measured(scores.scans).loc[[scores.methods[0], other]]
+    found = found[[name for name in COMPARED if name in found]].dropna(axis='columns', how='all')
+    scales = [1e3 if name == 'seconds' else 100.0 for name in found]
+    rows = [
+        {
+            'measure': COMPARED[name],
+            'given': given,
+            'peer': peer,
+            'difference': given - peer,
+            'interval': interval_text(scores, other, MEASURES[name], scale=scale),
+        }
+        for (name, (given, peer)), scale in zip(found.items(), scales, strict=True)
     ]
+    forms = {
+        'given': Form('given', '.2f', scales),
+        'peer': Form(title_of(other), '.2f', scales),
+        'difference': Form('difference', '+.2f', scales),
+        'interval': FORMS['interval'],
+    }
+    title = f'Given minus {title_of(other)}; {interval_note(scores)}'
+    return Table(title, frame_of(rows), forms, [_changed_note(scores.scans, other)])
+
+
+def _changed_note(scans: DataFrame, other: str) -> str:
+    """Say how many points have another label than by the first method, and where most."""
+    own = scans[scans['method'] == other]
+    changed = ratio(own['n_changed'], own['points'])
+    most = changed.sort_values(ascending=False, kind='stable').head(N_NAMED)
+    where = own['sequence'] + '/' + own['index']
+    named = ', '.join(f'{where[k]} ({value:.2%})' for k, value in most.items())
+    whole = ratio(own['n_changed'].sum(), own['points'].sum())
+    return f'points with two labels: {whole:.2%}; most in {named}'
+
+
+def _time_table(scores: Scores, n_workers: int) -> Table:
+    """Time of a frame, and in a note that of the stages of ours."""
+    table = scores.scans.groupby('method', sort=False)['seconds'].agg(['median', 'mean'])
+    table['ratio'] = table['median'].iloc[0] / table['median']
+    own = scores.times[scores.times['method'] == scores.methods[0]].drop(columns=[*KEYS])
+    stages = ', '.join(f'{name} {1e3 * s:.1f}' for name, s in own.median().items())
+    together = f', by {n_workers} workers at once' if n_workers else ''
+    title = f'Time per frame, reading left out{together} [ms]'
+    return Table(title, table.rename(index=title_of).reset_index(), FORMS, [f'stages: {stages}'])

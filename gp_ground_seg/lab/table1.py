@@ -6,23 +6,20 @@ Local-Smoothness Estimation", arXiv 2112.05847.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from gp_ground_seg.core.errors import ConfigError, DataError
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.frame import OUTSIDE, FloatArray
 from gp_ground_seg.core.parameters.config import PRESETS, Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.semantic_kitti import Frame
-from gp_ground_seg.lab.cluster import HERE, Progress, Runner
-from gp_ground_seg.lab.experiments.variants import refuse_changed
-from gp_ground_seg.lab.scoring.evaluate import OurMethod, as_it_is, load_kitti, score_methods
-from gp_ground_seg.lab.scoring.metrics import height_ratios, height_sums
-from gp_ground_seg.lab.scoring.report import Column, Report, Table, changed_parameters
+from gp_ground_seg.lab.cluster import HERE, Runner
+from gp_ground_seg.lab.scoring.evaluate import OurMethod, load_kitti, score_methods
+from gp_ground_seg.lab.scoring.metrics import HEIGHT_MEASURES, height_sums
+from gp_ground_seg.lab.scoring.report import Form, Report, Table, changed_parameters, frame_of
 
 MODELS = {'Z-L': 'latent', 'Z': 'line_gradient'}
 """The paper's method and the one it is compared with, as values of ``length_scale.model``."""
@@ -55,80 +52,54 @@ def table1(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Rep
     With the parameters given (ours), and with the preset ``paper``. Each method runs on each frame
     of `CHOICES` once without counting, then `N_REPEATS` times, alternately.
     """
-    refuse_changed(config, ['length_scale.model', 'learning.fixed'], {'learning.fixed': 'none'})
-    if config.learning.mode == 'fixed':
-        raise ConfigError('learning.mode = fixed: the table is of what is learned, leave it out')
-    last = config.grid.n_segments - 1
-    for segment in itertools.chain(*CHOICES.values()):
-        if not 0 <= segment <= last:
-            raise ConfigError(f'segment {segment}: must be in [0, {last}]')
     frames = {(frame.sequence, frame.index): frame for frame in items}
     for sequence, index in CHOICES:
         if (sequence, index) not in frames:
             raise DataError(f'no frame {index} in sequence {sequence}')
-    ((rows, backend),) = runner.run(partial(_measure, config, frames), [*CHOICES])
-    printed = [
+    rows: list[dict[str, Any]] = []
+    for by, own in {'ours': config, 'preset': PRESETS['paper'].config}.items():
+        changes = {'learning.fixed': 'none'}
+        methods = [
+            OurMethod(own.replace(**{'length_scale.model': model}, **changes), name)
+            for name, model in MODELS.items()
+        ]
+        for choice, segments in CHOICES.items():
+            rows += ({'by': by, **row} for row in _rows(frames[choice], segments, methods, runner))
+    printed = (
         {'segment': name, 'by': 'paper', **dict(zip((*VALUES, *ERRORS), row, strict=True))}
         for name, row in PRINTED.items()
-    ]
-    known = {'segment', 'by', *VALUES, *(name for name in rows[0] if 'inliers' in name)}
+    )
+    every = frame_of([*rows, *printed])
     variances = (
         'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar without unit]; preset: '
         'the preset paper; paper: as printed, of its segments a to d'
     )
     errors = (
         'SMSE in sample (at the inliers) and held out (n points of labelled ground); seconds per '
-        'frame: '
-        f'median of {N_REPEATS} runs on the whole frame, reading left out'
+        f'frame: median of {N_REPEATS} runs on the whole frame, reading left out'
     )
+    forms = {name: Form(name, '.0f' if name in ('n_PG', 'n_L') else '#.4g') for name in rows[0]}
+    forms |= {name: Form(name, '.4f') for name in forms if name.startswith('t ')}
+    forms |= {name: Form(name) for name in ('segment', 'by')}
+    forms['held out n'] = Form('n', '.0f')
+    held_out = 'held out n', 'held out Z-L', 'held out Z'
     tables = {
-        'variances': _table([*rows, *printed], VALUES, variances),
-        'errors': _table([*rows, *printed], [n for n in rows[0] if n not in known], errors),
+        'variances': Table(variances, every[['segment', 'by', *VALUES]], forms),
+        'errors': Table(
+            errors, every[['segment', 'by', *ERRORS[:2], *held_out, *ERRORS[2:]]], forms
+        ),
     }
     facts = {'config_changes': changed_parameters(config), 'config': config.nested()}
-    return Report(tables, rows, backend, facts)
-
-
-def _measure(
-    config: Config,
-    frames: Mapping[tuple[str, str], Frame],
-    choices: Sequence[tuple[str, str]],
-    progress: Progress,
-) -> tuple[list[dict[str, Any]], str]:
-    """Rows of the segments chosen, and the backend."""
-    fixed = {'learning.fixed': 'none'}
-    methods = {
-        by: [
-            OurMethod(own.replace(**{'length_scale.model': model}, **fixed), name)
-            for name, model in MODELS.items()
-        ]
-        for by, own in {'ours': config, 'preset': PRESETS['paper'].config}.items()
-    }
-    rows: dict[str, list[dict[str, Any]]] = {by: [] for by in methods}
-    for choice in progress(choices):
-        for by, own in methods.items():
-            found = _rows(frames[choice], CHOICES[choice], own)
-            rows[by] += ({'by': by, **row} for row in found)
-    return [*itertools.chain(*rows.values())], methods['ours'][0].last.fit.backend
-
-
-def _table(rows: Sequence[dict[str, Any]], names: Sequence[str], title: str) -> Table:
-    columns = {Column(name): [row[name] for row in rows] for name in ('segment', 'by')}
-    for name in names:
-        number = '.4f' if name.startswith('t ') else '#.4g'
-        form = 'd' if isinstance(rows[0][name], int) else number
-        column = Column(name.replace('held out n', 'n'), form, key=name)
-        columns[column] = [row.get(name) for row in rows]
-    return Table(columns, title)
+    return Report(tables, rows, methods[0].last.fit.backend, facts)
 
 
 def _rows(
-    frame: Frame, segments: Sequence[int], methods: Sequence[OurMethod]
+    frame: Frame, segments: Sequence[int], methods: Sequence[OurMethod], runner: Runner
 ) -> list[dict[str, Any]]:
     """Rows of a frame, by title of the column."""
     scan = load_kitti(frame)
     z = scan.points[:, 2].astype(np.float64)
-    scores = score_methods([scan] * N_REPEATS, methods, as_it_is, each_alone=True)
+    scores = score_methods([scan] * N_REPEATS, methods, lambda scan: scan, runner=runner)
     seconds = scores.scans.groupby('method', sort=False)['seconds'].median()
     results = {method.name: method.last for method in methods}
     # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
@@ -176,4 +147,4 @@ def _in_sample(result: Segmentation, segment: int) -> tuple[int, float]:
 
 def _smse(truth: FloatArray, estimate: FloatArray) -> float:
     """Standardised mean squared error of heights, (n,) [m]."""
-    return float(height_ratios(height_sums(truth, estimate))['smse'])
+    return float(HEIGHT_MEASURES['smse'](height_sums(truth, estimate)))

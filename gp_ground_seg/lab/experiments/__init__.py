@@ -1,1 +1,0 @@
-"""Experiments: configurations scored over frames."""
