@@ -190,14 +190,14 @@ def test_callers_whose_numpy_raises_get_the_same(backend, scan, tilt):
     expected = segmenter.segment(scan, tilt)
     model = GroundModel.of(expected)
     places = np.concatenate([scan[:100, :2], [[30.0, 5e-324]]]).T
-    heights, knots = model.at(*places), model.knot_points(1.0)
+    heights, knots = model.at(*places), model.knot_points()
     with np.errstate(all='raise'):
         result = segmenter.segment(scan, tilt)
         same(result, expected)
         assert result.fit.n_inliers == expected.fit.n_inliers
         model = GroundModel.of(result)
         np.testing.assert_array_equal(model.at(*places), heights)
-        np.testing.assert_array_equal(model.knot_points(1.0), knots)
+        np.testing.assert_array_equal(model.knot_points(), knots)
         np.testing.assert_array_equal(result.pose.level(scan[8:]), expected.pose.level(scan[8:]))
         result.surface.at(result.grid)
 
