@@ -71,7 +71,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
          {'metavar': 'OUT'}),
         ('--format', 'of the output (default: by the name of OUT, else labels of .bin scans, and '
          f'as the input; mcap for ROS 1): {", ".join(formats)}',
-         {'type': options.one_of(formats), 'metavar': 'FORMAT'}),
+         {'choices': formats, 'metavar': 'FORMAT'}),
         *options.CLOUDS,
         options.FORCE,
         options.QUIET,

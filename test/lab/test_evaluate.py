@@ -19,7 +19,7 @@ from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab.scenes import SimulatedFrame, load_simulated
 from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.scoring import metrics
-from gp_ground_seg.lab.scoring.evaluate import KEYS, OurMethod, sums, with_all
+from gp_ground_seg.lab.scoring.evaluate import STAGE, OurMethod, sums, with_all
 from gp_ground_seg.lab.scoring.metrics import COUNTS, label_ratios
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
 from gp_ground_seg.lab.scoring.tables import IOU
@@ -127,25 +127,13 @@ def test_scores_of_a_rule_known_by_hand(tmp_path):
     assert scores.scans.iloc[0][[*expected]].to_dict() == pytest.approx(expected, nan_ok=True)
 
 
-class GuessedProbabilities(HeightRule):
-    """A height rule that also gives a probability, by height."""
-
-    def probability(self):
-        return np.clip(-0.5 - self.points[:, 2], 0.0, 1.0).astype(np.float32)
-
-
-def test_errors_of_rings_are_all_errors_and_sequences_are_pooled(tmp_path):
+def test_errors_of_rings_are_all_errors(tmp_path):
     write_streets(tmp_path, s00=2, s08=1)
-    rules = HeightRule('misses', -1.72), GuessedProbabilities('invents', -1.0)
-    scores = evaluate(tmp_path, *rules)
+    scores = evaluate(tmp_path, HeightRule('misses', -1.72), HeightRule('invents', -1.0))
     pooled = sums(scores.scans)
     assert pooled.loc['misses', 'fn'] > 0 and pooled.loc['invents', 'fp'] > 0
     for name in scores.methods:
         assert counts(scores, name, scores.rings) == counts(scores, name)
-    assert set(scores.bins['method']) == {'invents'}
-    by_sequence = scores.bins.groupby('sequence')['n'].sum()
-    n_scored = sum(counts(scores, 'invents'))
-    assert by_sequence.sum() == n_scored and (by_sequence > 0).tolist() == [True, True]
 
 
 def test_data_that_does_not_fit_is_an_error_and_a_refused_scan_is_named(tmp_path):
@@ -170,10 +158,11 @@ def test_ours_is_the_library(tmp_path):
     expected = metrics.height_sums(*(values[ground] for values in heights))
     expected |= metrics.count_labels(result.label, scan.truth)
     expected['sensor_height'] = result.pose.height
-    (scored,), (times,) = scores.scans.to_dict('records'), scores.times.to_dict('records')
+    (scored,) = scores.scans.to_dict('records')
     assert expected.items() <= scored.items()
-    assert 'total' not in times
-    assert 0.0 < sum(t for name, t in times.items() if name not in KEYS) <= scored['seconds']
+    times = {name: t for name, t in scored.items() if name.startswith(STAGE)}
+    assert times.keys() == {f'{STAGE}{name}' for name in result.timings} - {f'{STAGE}total'}
+    assert 0.0 < sum(times.values()) <= scored['seconds']
 
 
 def run_peer(scene, sensor='vlp-16', **options):
@@ -257,7 +246,7 @@ def test_tables_hold_the_sums_of_the_frames(root, evaluated, capfd):
         return label_ratios({n: sum(f[n] for f in own) for n in COUNTS})
 
     for name, row in zip(('00', '08', 'all'), document['groundgrid'], strict=True):
-        ours, its = (ratios_of(method, name) for method in ('gp_ground_seg', 'patchworkpp'))
+        ours, its = (ratios_of(method, name) for method in ('gp_ground_seg', 'Patchwork++'))
         difference = ours['iou'] - its['iou']
         expected = {'sequence': name, 'n_scans': {'00': 2, '08': 1, 'all': 3}[name], **ours}
         assert row == {**expected, 'peer_iou': its['iou'], 'difference': difference}
@@ -270,18 +259,13 @@ def test_tables_hold_the_sums_of_the_frames(root, evaluated, capfd):
     ratios = [f'{100 * ours[key]:.2f}' for key in ('iou', 'precision', 'recall')]
     assert re.findall(r'(\S+) %', last) == ratios
     assert last.startswith('gp_ground_seg: IoU ') and last.endswith(' ms')
-    mine, its = document['times']
-    seconds = [f['seconds'] for f in frames if f['method'] == 'patchworkpp']
-    assert its['median'] == pytest.approx(np.median(seconds))
-    assert its['ratio'] == pytest.approx(mine['median'] / its['median'])
     assert document['environment']['versions']['pypatchworkpp']
-    assert sum(document['stages']['gp_ground_seg'].values()) > 0.0
     # Pose and state of learning are those of our method only.
     for row in frames:
-        assert (row['status'] in ('converged', 'budget')) == (row['method'] != 'patchworkpp')
+        assert (row['status'] in ('converged', 'budget')) == (row['method'] != 'Patchwork++')
 
 
-def test_rings_heights_and_probabilities(evaluated):
+def test_rings_and_heights(evaluated):
     document = json.loads((evaluated / 'a.json').read_text())
     rings = {row['range']: row for row in document['rings']}
     assert rings['> 50 m']['iou'] is rings['> 50 m']['peer_iou'] is None
@@ -297,9 +281,6 @@ def test_rings_heights_and_probabilities(evaluated):
         for name in ('within_1', 'within_2', 'bias'):
             assert row[name] == pytest.approx(share @ [one[name] for one in parts])
         assert row['median_absolute'] == np.median([one['median_absolute'] for one in parts])
-        its = [one for one in document['reliability'] if one['sequence'] == row['sequence']]
-        gap = sum(abs(one['n_ground'] - one['p']) for one in its)
-        assert row['ece'] == pytest.approx(gap / sum(one['n'] for one in its))
 
 
 def test_frames_without_a_scored_point(tmp_path):

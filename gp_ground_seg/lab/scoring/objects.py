@@ -82,10 +82,9 @@ class Objects:
     ground_z: npt.NDArray[np.floating]
 
 
-OBJECT_COUNTS = ('n_returns', 'n_ground', 'n_objects', 'n_lost', 'n_unknown')
+OBJECT_COUNTS = ('n_returns', 'n_ground', 'n_objects', 'n_lost')
 """Returns from `MIN_HEIGHT` above the ground, and those called ground; objects with at least
-`MIN_RETURNS` of them, and those with more than half of them called ground; returns at any height
-that do not count, as their ground is not known."""
+`MIN_RETURNS` of them, and those with more than half of them called ground."""
 
 
 def count_objects(
@@ -95,15 +94,14 @@ def count_objects(
 
     `points` (N, >=3) are x, y, z [m], `label` (N,) what a method says of them; UNKNOWN is not
     ground. A return counts in the band of its horizontal range, an object in that of the
-    median of its returns that count. Classes without a return that counts, or would, are left out.
+    median of its returns that count. Classes without a return that counts are left out.
     """
     check_lengths(len(points), **vars(objects))
     x, y, z = points[:, :3].astype(np.float64).T
     reach = np.hypot(x, y)
     on = (objects.class_of >= 0) & np.isfinite(reach + z)
     least = np.where(_is_low(objects.class_of), LOW_MIN_HEIGHT, MIN_HEIGHT)
-    counts, lacks = on & (z - objects.ground_z >= least), on & np.isnan(objects.ground_z)
-    unknown = _by_class_and_band(objects.class_of[lacks], reach[lacks], lacks[lacks])
+    counts = on & (z - objects.ground_z >= least)
     kind, reach, is_ground = objects.class_of[counts], reach[counts], label[counts] == Label.GROUND
     returns = _by_class_and_band(kind, reach, is_ground)
 
@@ -118,7 +116,7 @@ def count_objects(
     enough = n_returns >= np.where(_is_low(of_object[:, 0]), LOW_MIN_RETURNS, MIN_RETURNS)
     lost = 2 * n_ground[enough] > n_returns[enough]
     found = _by_class_and_band(of_object[enough, 0], middle[enough], lost)
-    bands = np.concatenate([returns, found, unknown[:, :, :1]], axis=2)
+    bands = np.concatenate([returns, found], axis=2)
     return [
         {'class': name, 'range': band, **dict(zip(OBJECT_COUNTS, numbers, strict=True))}
         for name, found in zip(CLASSES, bands.tolist(), strict=True)
