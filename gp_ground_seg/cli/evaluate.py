@@ -35,16 +35,11 @@ from gp_ground_seg.lab.scoring.report import (
 
 DESCRIPTION = """\
 Segment labelled frames and score the labels in the GroundGrid convention, which leaves
-vegetation out: precision, recall, F1, accuracy, IoU, time per frame. Count vehicles, persons
-and cyclists that are lost: the share of their returns from 0.3 m above the local ground that
-is labelled ground, and the objects with more than half of these returns labelled ground.
-Objects are the instances of the labels (their upper 16 bits). The last line is the result.
-
-Low things: the returns of vehicles, persons and cyclists more than --cut above the ground are
-taken out, and what is left is segmented in a second run, which does not count in the times.
-The share of the low returns that is labelled ground is reported. False cells: the share of the
-cells of 0.1 m of road, and of ground, in which a return of it is labelled obstacle, 0.15 m or
-more over the surface. Patchwork++ has no such heights.
+vegetation out: precision, recall, IoU, heights, time per frame. Count the vehicles, persons and
+cyclists that are lost: of their returns from 0.3 m above the ground more than half are called
+ground. Objects are the instances of the labels (their upper 16 bits). Count low things, which
+are objects cut at --cut, and false cells, where ground is taken for an obstacle. docs/accuracy.md
+says how. The last line is the result.
 
 With --against a second set of parameters, or with --peer Patchwork++, runs in turns on the same
 frames. Each difference has a bootstrap interval over the sequences, or over blocks of frames of

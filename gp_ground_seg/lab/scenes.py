@@ -173,7 +173,7 @@ def _scene_table(scores: Scores) -> Table:
         found = found.assign(**{kind: own['n_objects'], f'lost_{kind}': own['n_lost']})
         forms |= {kind: Form(kind, *COUNT), f'lost_{kind}': Form('lost', *COUNT)}
     lost = [name for name in found if name.startswith('lost_')]
-    table = beside(found, scores.methods, 'iou', 'rmse', *lost)
+    table = beside(found, scores, 'iou', 'rmse', *lost)
     title = (
         'IoU of the ground against exact labels [%]; RMSE of the surface [cm]; vehicles, persons '
         'and cyclists, and those lost'
@@ -189,7 +189,7 @@ def _low_table(scores: Scores) -> Table:
     shares = ratio(by_class['n_lost'], by_class['n_objects']).unstack('class')
     things = sums(low, 'sequence')['n_objects'].to_frame('things')
     found = things.join(shares.reindex(columns=[*LOW_CLASSES]))
-    table = beside(found, scores.methods, *LOW_CLASSES)
+    table = beside(found, scores, *LOW_CLASSES)
     title = 'Low things by height, in plain view 3 to 20 m away, and the share that is lost [%]'
     forms = {name: Form(name.removeprefix('low, '), '.0f', 100.0) for name in LOW_CLASSES}
     forms['things'] = Form('things', *COUNT)
@@ -202,7 +202,7 @@ def _rough_table(scores: Scores) -> Table:
     found['scene'] = found['sequence'].str.split().str[1]
     how = {'n_scans': 'sum', 'n_objects': 'sum', 'iou': 'mean', 'rmse': 'mean', 'n_lost': 'sum'}
     found = found.groupby(['method', 'scene'], sort=False).agg(how)
-    table = beside(found, scores.methods, 'iou', 'rmse', 'n_lost')
+    table = beside(found, scores, 'iou', 'rmse', 'n_lost')
     means = table.mean()
     means.update(table.filter(like='n_').sum())
     table.loc[ALL] = means

@@ -114,26 +114,20 @@ def test_what_a_method_learns_from_cut_scans_it_does_not_know_in_whole_ones(tmp_
     assert 'low_things_n' in cut and 'low_things_n' not in plain
 
 
-def test_scores_of_a_rule_known_by_hand(tmp_path):
-    write_streets(tmp_path, s00=1)
+def test_scores_of_rules_known_by_hand(tmp_path):
+    write_streets(tmp_path, s00=1, s08=1)
     points, semantic = street()
-    low = points[:, 2] < -1.5
-    scores = evaluate(tmp_path, HeightRule('rule', -1.5))
-    road, wall = semantic == 40, semantic == 50
-    n_road, n_false, n_right = (int(x.sum()) for x in (road, wall & low, wall & ~low))
-    assert counts(scores, 'rule') == (n_road, n_false, 0, n_right)
-    # The rule has a surface at its height.
-    expected = metrics.height_sums(points[road, 2].astype(float), np.full(n_road, -1.5))
-    assert scores.scans.iloc[0][[*expected]].to_dict() == pytest.approx(expected, nan_ok=True)
-
-
-def test_errors_of_rings_are_all_errors(tmp_path):
-    write_streets(tmp_path, s00=2, s08=1)
-    scores = evaluate(tmp_path, HeightRule('misses', -1.72), HeightRule('invents', -1.0))
-    pooled = sums(scores.scans)
-    assert pooled.loc['misses', 'fn'] > 0 and pooled.loc['invents', 'fp'] > 0
-    for name in scores.methods:
-        assert counts(scores, name, scores.rings) == counts(scores, name)
+    heights = {'rule': -1.5, 'misses': -1.72, 'invents': -1.0}
+    scores = evaluate(tmp_path, *(HeightRule(*one) for one in heights.items()))
+    road, wall, z = semantic == 40, semantic == 50, points[:, 2]
+    for name, height in heights.items():
+        low = z < height
+        expected = [2 * int(x.sum()) for x in (road & low, wall & low, road & ~low, wall & ~low)]
+        assert [*counts(scores, name)] == [*counts(scores, name, scores.rings)] == expected
+        # The rule has a surface at its height.
+        errors = metrics.height_sums(z[road].astype(float), np.full(road.sum(), height))
+        row = scores.scans[scores.scans['method'] == name].iloc[0]
+        assert row[[*errors]].to_dict() == pytest.approx(errors, nan_ok=True)
 
 
 def test_data_that_does_not_fit_is_an_error_and_a_refused_scan_is_named(tmp_path):
@@ -265,22 +259,18 @@ def test_tables_hold_the_sums_of_the_frames(root, evaluated, capfd):
         assert (row['status'] in ('converged', 'budget')) == (row['method'] != 'Patchwork++')
 
 
-def test_rings_and_heights(evaluated):
+def test_tables_of_rings_and_heights_hold_those_of_the_frames(evaluated):
     document = json.loads((evaluated / 'a.json').read_text())
     rings = {row['range']: row for row in document['rings']}
     assert rings['> 50 m']['iou'] is rings['> 50 m']['peer_iou'] is None
     assert rings['all']['iou'] == document['groundgrid'][-1]['iou']
     assert sum(row['share_of_errors'] for row in rings.values()) == pytest.approx(2.0)
     own = [row for row in document['rows'] if row['method'] == 'gp_ground_seg']
-    for row in document['heights']:
-        parts = [one for one in own if row['sequence'] in (one['sequence'], 'all')]
-        n = np.array([one['n_points'] for one in parts])
-        share = n / n.sum()
-        assert row['n_points'] == n.sum()
-        assert row['rmse'] ** 2 == pytest.approx(share @ [one['rmse'] ** 2 for one in parts])
-        for name in ('within_1', 'within_2', 'bias'):
-            assert row[name] == pytest.approx(share @ [one[name] for one in parts])
-        assert row['median_absolute'] == np.median([one['median_absolute'] for one in parts])
+    *_, pooled = document['heights']
+    share = np.array([one['n_points'] for one in own]) / pooled['n_points']
+    assert share.sum() == pytest.approx(1.0)
+    assert pooled['rmse'] ** 2 == pytest.approx(share @ [one['rmse'] ** 2 for one in own])
+    assert pooled['median_absolute'] == np.median([one['median_absolute'] for one in own])
 
 
 def test_frames_without_a_scored_point(tmp_path):

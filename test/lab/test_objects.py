@@ -186,7 +186,7 @@ def test_objects_are_cut_and_what_counts_is_low_and_near():
     # Labels are of what is left: ground is what lies 0.2 m over it, and so two of four are.
     left = points[cut.is_kept]
     label = np.where(left[:, 2] - (-1.73 - 0.1 * left[:, 0]) < 0.3, Label.GROUND, Label.OBSTACLE)
-    assert cut.count(label.astype(np.uint8)) == {'low_things_n': 4, 'low_things_wrong': 2}
+    assert cut.count_ground(label.astype(np.uint8)) == {'low_things_n': 4, 'low_things_wrong': 2}
     few = cut_objects(points[5:10], is_object[5:10], ~is_object[5:10], 0.45)
     assert few.is_kept.all() and not few.is_low.any()
 
@@ -261,7 +261,7 @@ def test_tables_of_objects_low_things_and_false_cells_are_those_of_the_labels(tm
                 found.update({(band, name): row[name] for name in OBJECT_COUNTS})
         cut = cut_objects(points, is_car, is_ground, 1.0)
         assert 50 < (~cut.is_kept).sum() < 500 and cut.is_low.sum() > 50
-        sums.update(cut.count(segmenter.segment(points[cut.is_kept]).label))
+        sums.update(cut.count_ground(segmenter.segment(points[cut.is_kept]).label))
         sums.update(count_false_cells(points, result.label, result.height, entries & 0xFFFF))
     for row in document['objects']:
         own = {n: found[row['range'], n] for n in OBJECT_COUNTS}

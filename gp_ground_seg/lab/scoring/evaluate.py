@@ -224,7 +224,7 @@ def _low_things(scan: KnownScan, method: Method, *, forgets: bool) -> dict[str, 
     if forgets:
         method.reset()
     _run(method, replace(scan, points=scan.points[scan.cut.is_kept]))
-    return scan.cut.count(method.result().label)
+    return scan.cut.count_ground(method.result().label)
 
 
 def _score(scan: KnownScan, result: MethodResult | Segmentation) -> Rows:
@@ -272,6 +272,11 @@ class Scores(NamedTuple):
     def methods(self) -> list[str]:
         """Names of the methods, in order."""
         return list(self.scans['method'].unique())
+
+    @property
+    def peer(self) -> str:
+        """Name of the method that the first one is compared with, if there is one."""
+        return ''.join(self.methods[1:2])
 
     @property
     def sequences(self) -> list[str]:

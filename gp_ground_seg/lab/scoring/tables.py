@@ -136,16 +136,16 @@ def interval_note(scores: Scores) -> str:
     return f'95 % interval: bootstrap over {n} {kind}{few}; tie: it holds 0'
 
 
-def beside(found: DataFrame, methods: list[str], *compared: str) -> DataFrame:
-    """Return the rows of ours, with each column `compared` of the other method after that of ours.
+def beside(found: DataFrame, scores: Scores, *compared: str) -> DataFrame:
+    """Return the rows of ours, with each column `compared` of the peer after that of ours.
 
     `found` has the methods in the first level of its index. If ``iou`` is compared, the last
-    column is the difference. Without another method there is nothing to compare.
+    column is the difference. Without a peer there is nothing to compare.
     """
-    ours = found.loc[methods[0]]
-    if not methods[1:]:
+    ours = found.loc[scores.methods[0]]
+    if not scores.peer:
         return ours
-    peer = found.loc[methods[1], [name for name in compared if name in found]].add_prefix(PEER)
+    peer = found.loc[scores.peer, [name for name in compared if name in found]].add_prefix(PEER)
     both = ours.join(peer)
     both = both[[
         column for name in ours for column in (name, f'{PEER}{name}') if column in both
@@ -182,7 +182,7 @@ def make_report(tables: dict[str, Table], scores: Scores, config: Config) -> Rep
 
 def peer_note(scores: Scores, note: str = '') -> str:
     """Say in a title which method the peer is, and more of it."""
-    return ''.join(f'; peer: {name}{note}' for name in scores.methods[1:])
+    return f'; peer: {scores.peer}{note}' if scores.peer else ''
 
 
 def evaluation(scores: Scores, config: Config) -> Report:
@@ -196,9 +196,9 @@ def evaluation(scores: Scores, config: Config) -> Report:
         tables['rings'] = _ring_table(scores)
     if len(scores.objects):
         tables['objects'] = _object_table(scores)
-    if scores.methods[1:]:
+    if scores.peer:
         tables['measures'] = difference_table(scores)
-    return make_report({**tables, **time_tables(scores, *scores.methods[1:])}, scores, config)
+    return make_report({**tables, **time_tables(scores, scores.peer)}, scores, config)
 
 
 def _sequence_tables(scores: Scores) -> dict[str, Table]:
@@ -223,7 +223,7 @@ def _sequence_tables(scores: Scores) -> dict[str, Table]:
     return {
         name: Table(
             title + peer_note(scores),
-            beside(found[columns], scores.methods, *compared).reset_index(),
+            beside(found[columns], scores, *compared).reset_index(),
         )
         for name, (title, columns, compared) in parts.items()
     }
@@ -238,9 +238,9 @@ def _ring_table(scores: Scores) -> Table:
     whole = found.loc[(scores.methods[0], ALL), 'errors']
     found['share_of_errors'] = ratio(found['errors'], whole)
     found = found[['points', 'errors', 'share_of_errors', 'precision', 'recall', 'iou']]
-    table = beside(found, scores.methods, 'iou').loc[[*metrics.RING_TITLES, ALL]]
+    table = beside(found, scores, 'iou').loc[[*metrics.RING_TITLES, ALL]]
     title = 'IoU'
-    for peer in scores.methods[1:]:
+    if peer := scores.peer:
         parts = dict(iter(rows.groupby('range')))
         table['interval'] = [interval_text(scores, peer, IOU, parts[band]) for band in table.index]
         title = f'IoU minus that of {peer}, {interval_note(scores)},'
@@ -259,9 +259,9 @@ def _object_table(scores: Scores) -> Table:
     found = measured(rows, 'class', 'range')
     found['n_lost'] = found['n_lost'].where(found['n_objects'] > 0)
     found = found[['n_returns', 'share_ground', 'n_objects', 'n_lost']]
-    table = beside(found, scores.methods, 'share_ground', 'n_lost').loc[places]
+    table = beside(found, scores, 'share_ground', 'n_lost').loc[places]
     title = 'Objects: returns on them, and the share called ground [%]; objects, and those lost'
-    for peer in scores.methods[1:]:
+    if peer := scores.peer:
         ground = MEASURES['share_ground']
         table['interval'] = [interval_text(scores, peer, ground, parts[k]) for k in places]
         title += peer_note(scores, f'; of the share as ground: {interval_note(scores)}')
@@ -270,7 +270,7 @@ def _object_table(scores: Scores) -> Table:
 
 def difference_table(scores: Scores) -> Table:
     """Compare two methods by `COMPARED`; measures without data in the scans are left out."""
-    other = scores.methods[1]
+    other = scores.peer
     found = measured(scores.scans).loc[[scores.methods[0], other]]
     found = found[[name for name in COMPARED if name in found]].dropna(axis='columns', how='all')
     rows = [
