@@ -140,6 +140,7 @@ class BagReader(AbstractContextManager['BagReader']):
             self._open = stack.pop_all()
         self.topics: dict[str, str] = {}
         self._counts: dict[str, int] = {}
+        self._in_cdr: list[str] = []
         for name in dict.fromkeys(channel.topic for channel in channels):
             every = [c for c in channels if c.topic == name]
             # Messages that are not CDR are skipped on a topic that has others.
@@ -147,6 +148,7 @@ class BagReader(AbstractContextManager['BagReader']):
             kinds = {c.msgtype for c in cdr} or {f'{c.msgtype}, {c.encoding}' for c in every}
             self.topics[name] = ' and '.join(sorted(kinds))
             self._counts[name] = sum(c.n_messages for c in cdr or every)
+            self._in_cdr += [name] if cdr else []
 
     def __exit__(self, *error: object) -> None:
         """Close the files; nothing can be read afterwards."""
@@ -189,12 +191,12 @@ class BagReader(AbstractContextManager['BagReader']):
         raise DataError(f'{self.path}: {problem}')
 
     def messages(self, topics: Collection[str] | None = None) -> _Messages:
-        """Topic, recorded time [ns] and CDR bytes of each message, by default of all topics.
+        """Topic, recorded time [ns] and CDR bytes of each message, by default of all in CDR.
 
         In the order of their time; file after file in a split bag. Raises DataError if a topic is
         unknown, the bag damaged, or fewer messages can be read than it lists.
         """
-        expected = {name: self.n_messages(name) for name in topics or self.topics}
+        expected = {name: self.n_messages(name) for name in topics or self._in_cdr}
         found: Counter[str] = Counter()
         source = self._read(expected)
         while True:
