@@ -70,13 +70,14 @@ def _open_ros(path: Path, storage: str, stack: ExitStack) -> _Contents:
         for file in path.glob('*.db3') if path.is_dir() else [path]:
             check_sqlite_file(file)
     bag = stack.enter_context(rosbag1.Reader(path) if is_ros1 else rosbag2.Reader(path))
-    channels = []
-    for c in bag.connections:
-        encoding = 'ros1' if is_ros1 and c.msgtype != POINT_CLOUD2 else 'cdr'
-        channels.append(_Channel(c.topic, c.msgtype, encoding, c.msgcount or 0))
+    readable = [c for c in bag.connections if not is_ros1 or c.msgtype == POINT_CLOUD2]
+    channels = [
+        _Channel(c.topic, c.msgtype, 'cdr' if c in readable else 'ros1', c.msgcount or 0)
+        for c in bag.connections
+    ]
 
     def read(topics: Collection[str]) -> _Messages:
-        for c, time, raw in bag.messages([c for c in bag.connections if c.topic in topics]):
+        for c, time, raw in bag.messages([c for c in readable if c.topic in topics]):
             cdr = jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2) if is_ros1 else raw
             yield c.topic, time, bytes(cdr)
 
@@ -198,7 +199,8 @@ class BagReader(AbstractContextManager['BagReader']):
         """
         expected = {name: self.n_messages(name) for name in topics or self._in_cdr}
         found: Counter[str] = Counter()
-        source = self._read(expected)
+        # Without topics rosbags would read all.
+        source = self._read(expected) if expected else iter(())
         while True:
             # Errors of the caller, raised at the yield, must not pass through here.
             with self._naming():
