@@ -66,7 +66,7 @@ browser-test: $(VENV)/.dev chromium
 	$(BIN)/python -m pytest test/lab/test_browser.py
 
 torture: $(VENV)/.dev
-	$(BIN)/python test/torture.py
+	$(BIN)/python -m pytest -n auto --timeout=900 --timeout-method=thread test/torture.py
 
 bench: $(VENV)/.dev
 	$(BIN)/gp-ground-seg experiment speed $(KITTI)

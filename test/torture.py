@@ -1,24 +1,16 @@
-"""Hostile clouds, files and messages: `python test/torture.py`, TORTURE_SCALE=100 for a night.
+"""Hostile clouds, files and messages: `make torture`, TORTURE_SCALE=100 for a night.
 
-Each case follows from its number. `python test/torture.py PART FIRST STOP` runs some of a part in
-this process, and prints a line for each that fails. Without words, each part runs in processes of
-a hundred cases or so, where a crash or a hang is a failure too, and a record is printed at the end
-(docs/reliability.md shows the last one).
+Each case follows from its number. A test runs a hundred or so of them; a crash or a hang of the
+process is a failure too. With TORTURE_STEP=1 each is a test of its own, which -k can choose.
 """
 
-import contextlib
 import os
 import signal
-import subprocess
-import sys
-import tempfile
-import time
-import warnings
 from array import array
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import pytest
 from bag_samples import scan, write_ros1_bag, write_ros2_bag
 from foreign_files import CASES
 from rcl_interfaces.msg import Parameter, ParameterValue
@@ -35,11 +27,6 @@ from gp_ground_seg.data.cloud_files import WRITABLE, decode_file, encode_file
 from gp_ground_seg.data.clouds import Cloud
 from gp_ground_seg.data.inputs import list_inputs
 
-TEST = Path(__file__).parent
-PARTS = {'clouds': (1000, 100), 'readers': (300, 60), 'ros': (400, 200)}
-"""Number of cases of a short campaign, and of a process."""
-TIMEOUT = 900.0
-"""Time that a process may take [s]."""
 SLOWEST = 30
 """Time that the reading of a file may take [s]."""
 MAX_DIFFERENT = 0.02
@@ -346,7 +333,7 @@ def send(number, node, link, clock):
     for setter in SETTERS:
         link.request(setter, [hostile_parameter(rng, number % 256)])
     if number % 10 != 9:
-        return None
+        return
     seen = len(link.ground.messages)
     link.publish_until(
         to_message(street(2000)),
@@ -354,75 +341,43 @@ def send(number, node, link, clock):
         'answer to a valid cloud',
     )
     memory = int(Path(f'/proc/{node.popen.pid}/statm').read_text().split()[1]) * 4096
-    if memory > MAX_RSS:
-        return f'the node holds {memory / 1e6:.0f} MB'
-    _, mark, trace = node.log.partition('Traceback')
-    return f'{mark}{trace[:500]}'.replace('\n', ' | ')
+    assert memory < MAX_RSS, f'the node holds {memory / 1e6:.0f} MB'
+    assert 'Traceback' not in node.log, node.log.partition('Traceback')[2][:500]
 
 
-@contextlib.contextmanager
-def case_of(part):
-    """What runs a case of a part by its number, and returns or raises what is wrong."""
-    with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
-        warnings.simplefilter('default' if part == 'ros' else 'error')
-        if part != 'ros':
-            yield try_cloud if part == 'clouds' else lambda number: try_reader(number, Path(name))
-            return
-        words = '-p', 'use_sim_time:=true'
-        node, link = stack.enter_context(linked_process(Path(name), *words))
+def cases(n_cases, n_of_test):
+    """Numbers of the cases of a campaign, so many of them in a test."""
+    stop = max(1, round(n_cases * float(os.environ.get('TORTURE_SCALE', '1'))))
+    step = int(os.environ.get('TORTURE_STEP', n_of_test))
+    numbers = [range(k, min(k + step, stop)) for k in range(0, stop, step)]
+    return pytest.mark.parametrize('numbers', numbers, ids=lambda those: f'from {those.start}')
+
+
+def run_cases(numbers, run_case):
+    """Run every case; fail with a line for each that raises."""
+    failed = []
+    for number in numbers:
+        try:
+            run_case(number)
+        except Exception as error:
+            failed.append(f'case {number}: {type(error).__name__}: {error}')
+    assert not failed, '\n'.join(failed)
+
+
+@cases(1000, 100)
+def test_clouds(numbers):
+    run_cases(numbers, try_cloud)
+
+
+@cases(300, 60)
+def test_readers(numbers, tmp_path):
+    run_cases(numbers, lambda number: try_reader(number, tmp_path))
+
+
+@cases(400, 200)
+@pytest.mark.filterwarnings('default')
+def test_ros(numbers, tmp_path):
+    with linked_process(tmp_path, '-p', 'use_sim_time:=true') as (node, link):
         node.wait_until_settled()
         clock = link.probe.create_publisher(Clock, '/clock', 1)
-        yield lambda number: send(number, node, link, clock)
-
-
-def run_cases(part, first, stop):
-    """Print a line for each case that fails; the last number is that of the case at work."""
-    n_failed = 0
-    with case_of(part) as run_case:
-        for number in range(first, stop):
-            print(f'\r{number}', end='', flush=True)
-            try:
-                wrong = run_case(number)
-            except Exception as error:
-                wrong = f'{type(error).__name__}: {error}'
-            if wrong:
-                n_failed += 1
-                print(f'\rcase {number}: {wrong}', flush=True)
-    sys.exit(1 if n_failed else 0)
-
-
-def run_apart(part, first, stop):
-    """Run cases in a process of their own; return the lines of those that failed."""
-    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join([str(TEST.parent), str(TEST)])}
-    words = [sys.executable, __file__, part, str(first), str(stop)]
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, errors='replace',
-                              env=environment, timeout=TIMEOUT, check=False)  # fmt: skip
-    except subprocess.TimeoutExpired as error:
-        return [f'{part}: no end within {TIMEOUT:.0f} s: {error.stdout or b""!r}'[-200:]]
-    lines = [line.split('\r')[-1] for line in done.stdout.split('\n')]
-    failed = [f'{part}: {line}' for line in lines if ': ' in line]
-    if done.returncode != bool(failed):
-        failed.append(f'{part}: status {done.returncode} at {lines[-1]}: {done.stderr[-300:]}')
-    return failed
-
-
-def main():
-    """Run all parts, and print the record."""
-    scale, failures = float(os.environ.get('TORTURE_SCALE', '1')), 0
-    for part, (n_cases, n_of_process) in PARTS.items():
-        stop, started = max(1, round(n_cases * scale)), time.monotonic()
-        starts = range(0, stop, n_of_process)
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            runs = [pool.submit(run_apart, part, k, min(k + n_of_process, stop)) for k in starts]
-            failed = [line for run in runs for line in run.result()]
-        took = time.monotonic() - started
-        print(*failed, f'{part:10}{stop:8} cases {took:7.0f} s {len(failed):4} failures', sep='\n')
-        failures += len(failed)
-    sys.exit(1 if failures else 0)
-
-
-if __name__ == '__main__':
-    if len(sys.argv) == 1:
-        main()
-    run_cases(sys.argv[1], *map(int, sys.argv[2:]))
+        run_cases(numbers, lambda number: send(number, node, link, clock))

@@ -61,35 +61,25 @@ _Contents = tuple[list[_Channel], Callable[[Collection[str]], _Messages]]
 """Channels of a bag, and what reads the CDR messages of some topics in it."""
 
 
-def _open_ros1(path: Path, stack: ExitStack) -> _Contents:
-    """Open a ``.bag``. Its clouds become CDR, which other messages are not."""
-    from rosbags import rosbag1
+def _open_ros(path: Path, storage: str, stack: ExitStack) -> _Contents:
+    """Open a ROS 1 ``.bag``, whose clouds become CDR, a rosbag2 folder, or a ``.db3``."""
+    from rosbags import rosbag1, rosbag2
 
-    bag = stack.enter_context(rosbag1.Reader(path))
-    channels = []
-    for c in bag.connections:
-        encoding = 'cdr' if c.msgtype == POINT_CLOUD2 else 'ros1'
-        channels.append(_Channel(c.topic, c.msgtype, encoding, c.msgcount))
-
-    def read(topics: Collection[str]) -> _Messages:
-        for c, time, raw in bag.messages([c for c in bag.connections if c.topic in topics]):
-            yield c.topic, time, bytes(jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2))
-
-    return channels, read
-
-
-def _open_ros2(path: Path, stack: ExitStack) -> _Contents:
-    """Open a rosbag2 folder or a ``.db3``. All their messages are CDR."""
-    from rosbags import rosbag2
-
-    for file in path.glob('*.db3') if path.is_dir() else [path]:
-        check_sqlite_file(file)
-    bag = stack.enter_context(rosbag2.Reader(path))
-    channels = [_Channel(c.topic, c.msgtype, 'cdr', c.msgcount or 0) for c in bag.connections]
+    is_ros1 = storage == 'ros1'
+    if storage == 'sqlite3':
+        for file in path.glob('*.db3') if path.is_dir() else [path]:
+            check_sqlite_file(file)
+    bag = stack.enter_context(rosbag1.Reader(path) if is_ros1 else rosbag2.Reader(path))
+    readable = [c for c in bag.connections if not is_ros1 or c.msgtype == POINT_CLOUD2]
+    channels = [
+        _Channel(c.topic, c.msgtype, 'cdr' if c in readable else 'ros1', c.msgcount or 0)
+        for c in bag.connections
+    ]
 
     def read(topics: Collection[str]) -> _Messages:
-        for c, time, raw in bag.messages([c for c in bag.connections if c.topic in topics]):
-            yield c.topic, time, raw
+        for c, time, raw in bag.messages([c for c in readable if c.topic in topics]):
+            cdr = jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2) if is_ros1 else raw
+            yield c.topic, time, bytes(cdr)
 
     return channels, read
 
@@ -144,12 +134,14 @@ class BagReader(AbstractContextManager['BagReader']):
         self.storage = storage_of(self.path)
         with ExitStack() as stack:
             with self._naming():
-                is_ros2 = self.path.is_dir() or self.storage == 'sqlite3'
-                open_ros = _open_ros1 if self.storage == 'ros1' else _open_mcap
-                channels, self._read = (_open_ros2 if is_ros2 else open_ros)(self.path, stack)
+                if self.path.suffix == '.mcap' and self.path.is_file():
+                    channels, self._read = _open_mcap(self.path, stack)
+                else:
+                    channels, self._read = _open_ros(self.path, self.storage, stack)
             self._open = stack.pop_all()
         self.topics: dict[str, str] = {}
         self._counts: dict[str, int] = {}
+        self._in_cdr: list[str] = []
         for name in dict.fromkeys(channel.topic for channel in channels):
             every = [c for c in channels if c.topic == name]
             # Messages that are not CDR are skipped on a topic that has others.
@@ -157,6 +149,7 @@ class BagReader(AbstractContextManager['BagReader']):
             kinds = {c.msgtype for c in cdr} or {f'{c.msgtype}, {c.encoding}' for c in every}
             self.topics[name] = ' and '.join(sorted(kinds))
             self._counts[name] = sum(c.n_messages for c in cdr or every)
+            self._in_cdr += [name] if cdr else []
 
     def __exit__(self, *error: object) -> None:
         """Close the files; nothing can be read afterwards."""
@@ -199,14 +192,15 @@ class BagReader(AbstractContextManager['BagReader']):
         raise DataError(f'{self.path}: {problem}')
 
     def messages(self, topics: Collection[str] | None = None) -> _Messages:
-        """Topic, recorded time [ns] and CDR bytes of each message, by default of all topics.
+        """Topic, recorded time [ns] and CDR bytes of each message, by default of all in CDR.
 
         In the order of their time; file after file in a split bag. Raises DataError if a topic is
         unknown, the bag damaged, or fewer messages can be read than it lists.
         """
-        expected = {name: self.n_messages(name) for name in topics or self.topics}
+        expected = {name: self.n_messages(name) for name in topics or self._in_cdr}
         found: Counter[str] = Counter()
-        source = self._read(expected)
+        # Without topics rosbags would read all.
+        source = self._read(expected) if expected else iter(())
         while True:
             # Errors of the caller, raised at the yield, must not pass through here.
             with self._naming():

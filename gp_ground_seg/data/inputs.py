@@ -55,28 +55,26 @@ class Input:
     read: Callable[[], Cloud]
 
 
+@dataclass(frozen=True)
 class Inputs:
     """Clouds in their order: ``len()``, iteration and indices; read one at a time.
 
     A bag is read from its beginning each time; its clouds are best iterated over.
     """
 
-    def __init__(
-        self, path: Path, items: Sequence[Input], topic: str | None = None, n_messages: int = 0
-    ) -> None:
-        self.path = path
-        self.topic = topic  # of a bag, else None
-        self._items = items
-        self._n_messages = n_messages
+    path: Path
+    files: Sequence[Input]
+    topic: str | None = None  # of a bag
+    n_messages: int = 0  # on it
 
     def __len__(self) -> int:
         """Count the clouds."""
-        return self._n_messages or len(self._items)
+        return self.n_messages or len(self.files)
 
     def __iter__(self) -> Iterator[Input]:
         """Yield each cloud, not read yet."""
         if self.topic is None:
-            yield from self._items
+            yield from self.files
             return
         with BagReader(self.path) as bag:
             for k, (_, time, raw) in enumerate(bag.messages([self.topic])):

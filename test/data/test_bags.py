@@ -8,7 +8,6 @@ import pytest
 from rosbags import rosbag2
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosReliability
-from rosbags.typesys import Stores, get_typestore
 
 from gp_ground_seg.core.errors import DataError, MissingDependencyError
 from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag_folder, resolve_storage
@@ -66,8 +65,7 @@ def test_packed_bags_are_read(tmp_path, storage, mode):
     writer = rosbag2.Writer(tmp_path / 'drive', version=9, storage_plugin=plugin)
     writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
     with writer:
-        types = get_typestore(Stores.ROS2_JAZZY)
-        topic = writer.add_connection('/points', POINT_CLOUD2, typestore=types)
+        topic = writer.add_connection('/points', POINT_CLOUD2, typestore=jazzy_types())
         for k, data in enumerate(raw):
             writer.write(topic, k, data)
     assert is_bag_folder(tmp_path / 'drive')
