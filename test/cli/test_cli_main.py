@@ -1,8 +1,6 @@
 """The entry point: every command is there, and none costs what another imports."""
 
 import argparse
-import importlib
-import inspect
 import logging
 import re
 import shlex
@@ -107,14 +105,6 @@ def test_whatever_prints_a_table_has_json():
     found = {leaf.prog.split(' ', 1)[1] for leaf in leaves if '--json' in leaf.format_usage()}
     experiments = {f'experiment {name}' for name in EXPERIMENTS}
     assert found == {'evaluate'} | experiments
-
-
-@pytest.mark.parametrize('module', sorted({module for module, _ in cli.COMMANDS.values()}))
-def test_whatever_takes_long_shows_how_far_it_is(module):
-    source = inspect.getsource(importlib.import_module(f'gp_ground_seg.cli.{module}'))
-    assert ('options.progress(' in source or 'options.runner(' in source) == (
-        module not in ('config', 'plot', 'tune')
-    )
 
 
 ENTRY = 'from gp_ground_seg.cli.main import main; main({})'
