@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ from typing import Any
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import ConfigError, DataError, require, shown
 from gp_ground_seg.core.parameters.config import config_of
+from gp_ground_seg.core.parameters.schema import yaml_scalar
+from gp_ground_seg.data.files import staged_file
 from gp_ground_seg.data.inputs import Input, list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame, is_root, labelled_frames
 from gp_ground_seg.lab.cluster import Runner
@@ -103,7 +106,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.against is not None:
         other = config_of(arguments.against)
         methods.append(OurMethod(other, shown(Path(arguments.against).name)))
-        changed = options.changed_lines(other, config)
+        changed = [
+            f'{spec.name}: {yaml_scalar(before)} -> {yaml_scalar(after)} {spec.unit}'.rstrip()
+            for spec, before, after in other.differences(config)
+        ]
         if not changed:
             raise ConfigError(f'--against {arguments.against}: the same parameters as given')
     result: list[str] = []
@@ -136,7 +142,8 @@ def print_report(
     """
     if arguments.markdown:
         require('tabulate', 'tabulate')
-    with options.staged_json(arguments) as path:
+    target = arguments.json
+    with staged_file(target, force=arguments.force) if target else nullcontext() as path:
         with options.runner(arguments, title) as runner:
             report = measured(runner)
         environment = {**describe_environment(*packages), 'n_workers': runner.n_workers}
@@ -158,10 +165,8 @@ def _items(arguments: argparse.Namespace, cut: float) -> tuple[Any, Callable[[An
             f'{root}: no sequences/*/velodyne folder below it (SemanticKITTI layout); scans '
             'without labels need --against'
         )
-    for name in ('sequences', 'frame_step', 'cut', 'workers', 'scheduler'):
-        if getattr(arguments, name) is not None:
-            option = name.replace('_', '-')
-            raise DataError(f'--{option}: {root} has no sequences/*/velodyne below it')
+    names = ('sequences', 'frame_step', 'cut', 'workers', 'scheduler')
+    options.refuse(arguments, names, f'{root} has no sequences/*/velodyne below it')
     inputs = list_inputs(root, options.columns_of(arguments))
     return inputs, partial(_load_cloud, inputs.path.stem)
 

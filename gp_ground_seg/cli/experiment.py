@@ -108,10 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.simulated == (arguments.root is not None):
         raise DataError(f'{name}: give either ROOT or --simulated')
     others = ('sequences', 'frame_step') if arguments.simulated else ('sensors', 'scenes', 'seeds')
-    for option in others:
-        if vars(arguments).get(option) is not None:
-            words = option.replace('_', '-')
-            raise DataError(f'--{words}: is for the other kind of scans, see --simulated')
+    options.refuse(arguments, others, 'is for the other kind of scans, see --simulated')
     config = options.read_config(arguments) if experiment.takes_config else Config()
     measure: Callable[..., Report] = experiment.run
     with_peer = experiment.has_peer and not arguments.no_peer

@@ -7,7 +7,7 @@ import logging
 import math
 import sys
 from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,10 +27,8 @@ from gp_ground_seg.core.parameters.schema import (
     YAML_SUFFIXES,
     did_you_mean,
     load_yaml,
-    yaml_scalar,
 )
 from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, MIN_COLUMNS
-from gp_ground_seg.data.files import staged_file
 from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.lab.cluster import Runner, open_runner
 
@@ -95,7 +93,7 @@ def list_clouds(arguments: argparse.Namespace) -> Inputs:
     """Return the clouds of the input; DataError if ``--frame`` is none of them."""
     found = list_inputs(arguments.input, columns_of(arguments), arguments.topic)
     if found.topic is not None or not any(scan.path.suffix == '.bin' for scan in found):
-        refuse_columns(arguments, arguments.input)
+        refuse(arguments, ['columns'], f'is for .bin scans, which {arguments.input} is not')
     frame = getattr(arguments, 'frame', None)
     if frame is not None and not 0 <= frame < len(found):
         raise DataError(f'--frame {frame}: must be 0 to {len(found) - 1} here')
@@ -107,10 +105,11 @@ def columns_of(arguments: argparse.Namespace) -> int:
     return int(arguments.columns or KITTI_COLUMNS)
 
 
-def refuse_columns(arguments: argparse.Namespace, source: object) -> None:
-    """Raise a DataError if ``--columns`` is given, but `source` is no ``.bin`` scan."""
-    if arguments.columns is not None:
-        raise DataError(f'--columns: is for .bin scans, which {source} is not')
+def refuse(arguments: argparse.Namespace, names: Iterable[str], reason: str) -> None:
+    """Raise a DataError for the first of some options that is given."""
+    for name in names:
+        if vars(arguments).get(name) is not None:
+            raise DataError(f'--{name.replace("_", "-")}: {reason}')
 
 
 def add_cluster(parser: argparse.ArgumentParser) -> None:
@@ -201,14 +200,6 @@ def note_spared(given: Config, used: Config) -> None:
         note('segmented with numpy; to have compiled code, run gp-ground-seg warm-up once')
 
 
-def changed_lines(first: Config, second: Config) -> list[str]:
-    """Return a line for each parameter that differs, as in ``grid.n_bins: 80 -> 120``."""
-    return [
-        f'{spec.name}: {yaml_scalar(before)} -> {yaml_scalar(after)} {spec.unit}'.rstrip()
-        for spec, before, after in first.differences(second)
-    ]
-
-
 def parse_setting(setting: str) -> tuple[str, Any]:
     """Split ``NAME=VALUE``; the parameter's own checks come with `Config.replace`."""
     name, separator, text = setting.partition('=')
@@ -229,13 +220,6 @@ def note(message: str) -> None:
 def library_notes(level: int = logging.INFO) -> AbstractContextManager[None]:
     """Print what the library logs, such as that it compiles, as notes within the block."""
     return messages_passed_to(lambda _, text: note(text), level)
-
-
-def staged_json(arguments: argparse.Namespace) -> AbstractContextManager[Path | None]:
-    """Return a path for ``--json``, for a ``with`` block, at whose end the file appears."""
-    if arguments.json is None:
-        return nullcontext()
-    return staged_file(arguments.json, force=arguments.force)
 
 
 def count(number: int, noun: str) -> str:

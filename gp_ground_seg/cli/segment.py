@@ -89,11 +89,10 @@ def run(arguments: argparse.Namespace) -> int:
     source = Path(arguments.input)
     target = Path(arguments.output or _default_output(source, arguments.format))
     if holds_bag(source):
-        options.refuse_columns(arguments, source)
+        options.refuse(arguments, ['columns'], f'is for .bin scans, which {source} is not')
     else:
-        for name in 'topic', 'format':
-            if vars(arguments)[name] not in (None, *FORMATS):
-                raise DataError(f'--{name}: is for bags, which {source} is not')
+        of_bags = ['topic', *['format'] * (arguments.format not in FORMATS)]
+        options.refuse(arguments, of_bags, f'is for bags, which {source} is not')
     if arguments.more:
         _segment_into(target, _list_bags(arguments), arguments, config)
     elif holds_bag(source) and arguments.format not in FORMATS:
@@ -133,9 +132,7 @@ def _list_items(scans: Inputs, form: str | None, folder: str = '') -> list[Item]
 
 def _segment_to(target: Path, item: Item, arguments: argparse.Namespace, config: Config) -> None:
     """Segment one input into one file or bag."""
-    for name in 'workers', 'scheduler':
-        if vars(arguments)[name] is not None:
-            raise DataError(f'--{name}: is for several inputs')
+    options.refuse(arguments, ['workers', 'scheduler'], 'is for several inputs')
     if target.resolve() == item.path.resolve():
         raise DataError(f'{target}: is the input; name another output')
     if target.suffix[1:] in FORMATS:

@@ -49,7 +49,6 @@ CASES = {
     'ablation --simulated --seeds 1 --set grid.n_bins=40': ('pairs', 8),
     'steps ROOT --frame-step 3': ('steps', 9 * 2),
     'pseudo-inputs ROOT --frame-step 3 --set grid.n_bins=40': ('pseudo_inputs', 7 * 2),
-    'scenes --sensors vlp-16,os1-128 --scenes flat,slope --seeds 1': ('scenes', 2 * 4),
     'scenes --sensors vlp-16 --scenes low_boxes,flat --seeds 1': ('low', 2 * 2),
     'scenes --scenes flat,bank,ramp --sensors vlp-16,mid-360 --seeds 1': ('rough', 2 * 6),
     'scenes --no-peer --sensors vlp-16 --scenes kerb --seeds 1': ('scenes', 1),

@@ -141,30 +141,17 @@ def test_the_topic_can_be_chosen(segmenter, tmp_path):
         assert_splits(source, tmp_path / 'two_ground.mcap', topic, segmenter)
 
 
-def without_x(raw):
-    cloud = decode_cloud(raw)
-    fields = (dataclasses.replace(cloud.fields[0], name='q'), *cloud.fields[1:])
-    return encode_cloud(dataclasses.replace(cloud, fields=fields))
-
-
-@pytest.mark.parametrize(
-    ('damage', 'message'),
-    [
-        (lambda raw: raw[:5000], '5000 bytes that are no sensor_msgs/msg/PointCloud2'),
-        (without_x, 'point cloud: no field named x: must have exactly one; fields: q, y, z, i,'),
-    ],
-)
-def test_bad_cloud_stops_the_run_and_is_named(tmp_path, capsys, damage, message):
+def test_bad_cloud_stops_the_run_and_is_named(tmp_path, capsys):
     out = tmp_path / 'out'
     before = samples.write_ros2_bag(out)
     with BagWriter(tmp_path / 'in.mcap') as bag:
         bag.add_topic('/points')
         for k in range(4):
             raw = encode_cloud(samples.cloud(k))
-            bag.write('/points', 1000 + k, damage(raw) if k == 2 else raw)
+            bag.write('/points', 1000 + k, raw[:5000] if k == 2 else raw)
     assert segment(tmp_path / 'in.mcap', '-o', out, '--force') == 2
-    expected = f'in.mcap: message 2 of topic /points, recorded at 1002 ns: {message}'
-    assert expected in error_line(capsys)
+    place = 'in.mcap: message 2 of topic /points, recorded at 1002 ns: '
+    assert f'{place}5000 bytes that are no sensor_msgs/msg/PointCloud2' in error_line(capsys)
     assert sorted(path.name for path in tmp_path.iterdir()) == ['in.mcap', 'out']
     assert read_messages(out) == before
 
@@ -203,21 +190,12 @@ def test_scans_give_label_files(segmenter, tmp_path, capsys, monkeypatch, scans,
     assert hidden(out.parent) == hidden(out) == []
 
 
-def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
+def test_force_replaces_what_is_written_and_nothing_else(segmenter, tmp_path):
     write_scans(tmp_path / 'velodyne', n_scans=2)
     out = tmp_path / 'labels'
     out.mkdir()
-    mine = {'000001.label': 'by hand', 'readme': 'mine'}
-    for name, text in mine.items():
-        (out / name).write_text(text)
-    for source, target, share in (
-        ('velodyne', out, r' \(1 of 2 files to write do\)'),
-        ('velodyne/000000.bin', out / '000001.label', ''),
-    ):
-        assert segment(tmp_path / source, '-o', target) == 2
-        expected = rf'000001\.label: exists already{share}.* --force replaces'
-        assert re.search(expected, error_line(capsys))
-    assert {path.name: path.read_text() for path in out.iterdir()} == mine
+    for name in ('000001.label', 'readme'):
+        (out / name).write_text('mine')
     for source, target, k in (
         ('velodyne/000000.bin', out / '000001.label', 0),
         ('velodyne', out, 1),
@@ -237,11 +215,11 @@ def inputs(tmp_path_factory):
     for name in ('00', '08'):
         write_scans(folder / 'root/sequences' / name / 'velodyne', n_scans=1)
     samples.write_ros2_bag(folder / 'two.mcap', topics=('/front', '/ground'))
-    for name in ('empty', 'unfinished', 'arrays'):
+    for name in ('empty', 'unfinished', 'arrays', 'mine'):
         (folder / name).mkdir()
     for name in ('a.npy', 'arrays/a.npy'):
         np.save(folder / name, samples.scan())
-    for name in ('notes.md', 'taken.pcd'):
+    for name in ('notes.md', 'taken.pcd', 'mine/000000.label'):
         (folder / name).write_text('1 2 3\n')
     (folder / 'unfinished/x_0.mcap').write_bytes(b'')
     (folder / 'short.bin').write_bytes(b'0123456789')
@@ -272,6 +250,7 @@ def content(folder):
         ('root -o x.ply', 'x.ply: must be a folder'),
         ('good -o x.label', 'x.label: must be a folder'),
         ('good -o notes.md', 'notes.md: is a file, must be a folder'),
+        ('good -o mine', 'mine/000000.label: exists already (1 of 1 files to write do); --force'),
         ('arrays -o arrays --force', 'is the input'),
         ('good/000000.bin -o x.label --workers 2', '--workers: is for several inputs'),
         ('short.bin -o new', 'short.bin: 10 bytes is not a whole number'),

@@ -216,7 +216,5 @@ def test_scans_without_labels_have_points_that_differ_and_time_only(strict, tmp_
     *_, theirs, ours = said.splitlines()
     for line, name in ((theirs, strict.name), (ours, 'gp_ground_seg')):
         assert re.fullmatch(rf'{name}: no labels of the ground, [\d.]+ ms', line)
-    assert 'RMSE' not in said and 'Probabilities' not in said
-    assert f'{tmp_path.name}/0.bin ({share_changed(0):.2%})' in said.replace('\n  ', ' ') or (
-        f'{tmp_path.name}/0 ({share_changed(0):.2%})' in said.replace('\n  ', ' ')
-    )
+    assert 'RMSE' not in said
+    assert re.search(rf'{tmp_path.name}/0(.bin)? \({share_changed(0):.2%}\)', said)

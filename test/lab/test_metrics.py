@@ -29,11 +29,7 @@ def test_ratios_by_hand():
     rows = [dict(zip(counts, row, strict=True)) for row in zip(*counts.values(), strict=True)]
     found, nothing, only_obstacles = map(label_ratios, rows)
     assert (found['precision'], found['recall'], found['iou']) == (6 / 8, 6 / 10, 6 / 12)
-    assert found['f1'] == pytest.approx(2 * 0.75 * 0.6 / 1.35)
-    assert found['accuracy'] == 14 / 20
-    assert all(map(math.isnan, nothing.values())) and len(nothing) == 5
-    assert math.isnan(only_obstacles['iou'])
-    assert only_obstacles['accuracy'] == 1.0
+    assert all(map(math.isnan, [*nothing.values(), *only_obstacles.values()]))
     # Of a frame, row by row the same.
     for name, values in label_ratios(pd.DataFrame(counts)).items():
         expected = [found[name], nothing[name], only_obstacles[name]]

@@ -296,8 +296,10 @@ class Scores(NamedTuple):
     @classmethod
     def joined(cls, parts: Iterable[Scores]) -> Scores:
         """Join the scores of the same methods on several groups of scans."""
-        concat = require_pandas().concat
-        return cls(*(concat(frames, ignore_index=True) for frames in zip(*parts, strict=True)))
+        concat = partial(require_pandas().concat, ignore_index=True)
+        groups = [*zip(*parts, strict=True)]
+        # pandas warns of frames without a row.
+        return cls(*(concat([f for f in own if len(f)] or own[:1]) for own in groups))
 
 
 def make_scores(parts: Iterable[Rows]) -> Scores:

@@ -67,8 +67,6 @@ def share(part: str, whole: str) -> Measure:
 LABEL_MEASURES: dict[str, Measure] = {
     'precision': lambda s: ratio(s['tp'], s['tp'] + s['fp']),
     'recall': lambda s: ratio(s['tp'], s['tp'] + s['fn']),
-    'f1': lambda s: ratio(s['tp'] + s['tp'], s['tp'] + s['tp'] + s['fp'] + s['fn']),
-    'accuracy': lambda s: ratio(s['tp'] + s['tn'], s['tp'] + s['fp'] + s['fn'] + s['tn']),
     'iou': lambda s: ratio(s['tp'], s['tp'] + s['fp'] + s['fn']),
 }
 """Measures of `COUNTS`."""

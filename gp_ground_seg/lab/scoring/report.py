@@ -6,7 +6,6 @@ import json
 import os
 import platform
 import subprocess
-import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -21,8 +20,6 @@ from gp_ground_seg.lab.cluster import package_versions
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-WIDTH = 100
-"""Columns of the terminal that titles and notes are folded to."""
 PEER = 'peer_'
 """Beginning of the names of columns of the other method."""
 
@@ -45,13 +42,9 @@ FORMS = {
     'points': Form('points', *COUNT),
     'precision': Form('precision', *SHARE),
     'recall': Form('recall', *SHARE),
-    'f1': Form('F1', *SHARE),
-    'accuracy': Form('accuracy', *SHARE),
     'iou': Form('IoU', *SHARE),
     'difference': Form('difference', *SIGNED),
     'interval': Form('95 % interval'),
-    'errors': Form('errors', *COUNT),
-    'share_of_errors': Form('of errors', *SHARE),
     'n_returns': Form('returns', *COUNT),
     'share_ground': Form('as ground', *SHARE),
     'n_objects': Form('objects', *COUNT),
@@ -111,7 +104,7 @@ class Table(NamedTuple):
             table = cells.to_markdown(index=False, disable_numparse=True, colalign=sides)
             return '\n\n'.join([self.title, table, *self.notes])
         rows = [cells.to_string(index=False)] if len(cells) else []
-        return '\n'.join([fold(self.title), *rows, *map(fold, self.notes)])
+        return '\n'.join([self.title, *rows, *self.notes])
 
 
 def frame_of(rows: Any, columns: Sequence[str] | None = None) -> DataFrame:
@@ -134,11 +127,6 @@ def records(frame: DataFrame) -> list[dict[str, Any]]:
     return found
 
 
-def fold(line: str) -> str:
-    """Fold a line for the terminal."""
-    return textwrap.fill(line, WIDTH, subsequent_indent='  ', break_on_hyphens=False)
-
-
 class Report(NamedTuple):
     """Tables to show, every number by scan or segment, the backend, and the parameters."""
 
@@ -150,7 +138,7 @@ class Report(NamedTuple):
     def text(self, machine: str, *, markdown: bool) -> str:
         """Return the tables, and below them the line on the machine."""
         tables = [table.text(markdown=markdown) for table in self.tables.values()]
-        return '\n\n'.join([*tables, machine if markdown else fold(machine)])
+        return '\n\n'.join([*tables, machine])
 
     def write(self, path: Path, environment: Mapping[str, Any], **facts: Any) -> None:
         """Write every number as JSON, and further `facts`."""

@@ -15,8 +15,8 @@ import numpy as np
 
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.lab.scoring import metrics, objects
-from gp_ground_seg.lab.scoring.evaluate import ALL, KEYS, STAGE, Scores, sums, with_all
-from gp_ground_seg.lab.scoring.metrics import COUNTS, Measure, ratio, share
+from gp_ground_seg.lab.scoring.evaluate import KEYS, STAGE, Scores, sums, with_all
+from gp_ground_seg.lab.scoring.metrics import Measure, ratio, share
 from gp_ground_seg.lab.scoring.report import (
     PEER,
     SHARE,
@@ -188,84 +188,71 @@ def peer_note(scores: Scores, note: str = '') -> str:
 def evaluation(scores: Scores, config: Config) -> Report:
     """Report of our method with `config`, and of at most one other method on the same scans.
 
-    Scans without labels have tables of time and of differing labels only.
+    Scans without labels have tables of time and of differing labels only. A further measure of
+    labelled scans is a column here.
     """
     tables: dict[str, Table] = {}
     if scores.has_truth:
-        tables |= _sequence_tables(scores)
-        tables['rings'] = _ring_table(scores)
+        tables['groundgrid'] = _grouped(
+            scores, 'GroundGrid convention: vegetation left out [%]',
+            scores.scans, ['sequence'], ['n_scans', *metrics.LABEL_MEASURES], ['iou'],
+        )  # fmt: skip
+        tables['low_things'] = _grouped(
+            scores, 'Low things and false cells [%]', scores.scans, ['sequence'],
+            [column for name in objects.SHARES for column in (f'{name}_n', name)],
+            [*objects.SHARES],
+        )  # fmt: skip
+        tables['heights'] = _grouped(
+            scores, 'Height of the ground under returns labelled ground [cm]; shares without a '
+            'model and within one and two standard deviations [%]',
+            scores.scans, ['sequence'], ['n_points', *HEIGHTS], ['rmse'],
+        )  # fmt: skip
+        minus = f' minus that of {scores.peer}' if scores.peer else ''
+        tables['rings'] = _grouped(
+            scores, f'IoU{minus} by horizontal range (GroundGrid convention) [%]',
+            scores.rings, ['range'], [*metrics.LABEL_MEASURES], ['iou'], 'iou',
+        )  # fmt: skip
     if len(scores.objects):
-        tables['objects'] = _object_table(scores)
+        tables['objects'] = _grouped(
+            scores, 'Objects: returns on them, and the share called ground [%]; objects, and '
+            'those lost', scores.objects, ['class', 'range'],
+            ['n_returns', 'share_ground', 'n_objects', 'n_lost'], ['share_ground', 'n_lost'],
+            'share_ground',
+        )  # fmt: skip
     if scores.peer:
         tables['measures'] = difference_table(scores)
     return make_report({**tables, **time_tables(scores, scores.peer)}, scores, config)
 
 
-def _sequence_tables(scores: Scores) -> dict[str, Table]:
-    """Labels, shares and heights by sequence and pooled. A further measure is a column here."""
-    found = measured(with_all(scores.scans), 'sequence')
-    shares = [column for name in objects.SHARES for column in (f'{name}_n', name)]
-    parts = {
-        'groundgrid': (
-            'GroundGrid convention: vegetation left out [%]',
-            ['n_scans', *metrics.LABEL_MEASURES], ['iou'],
-        ),
-        'low_things': (
-            'Low things and false cells [%]',
-            [name for name in shares if name in found], [*objects.SHARES],
-        ),
-        'heights': (
-            'Height of the ground under returns labelled ground [cm]; shares without a model and '
-            'within one and two standard deviations [%]',
-            ['n_points', *HEIGHTS], ['rmse'],
-        ),
-    }  # fmt: skip
-    return {
-        name: Table(
-            title + peer_note(scores),
-            beside(found[columns], scores, *compared).reset_index(),
-        )
-        for name, (title, columns, compared) in parts.items()
-    }
+def _grouped(
+    scores: Scores,
+    title: str,
+    frame: DataFrame,
+    by: list[str],
+    columns: list[str],
+    compared: list[str],
+    interval: str = '',
+) -> Table:
+    """Lay out measures of the groups of a frame, and of all in the last column of `by`.
 
-
-def _ring_table(scores: Scores) -> Table:
-    """Labels by horizontal range, with the intervals of the differences of the IoU."""
-    rows = with_all(scores.rings, 'range')
-    found = measured(rows, 'range')
-    found['points'] = found[[*COUNTS]].sum(axis='columns')
-    found['errors'] = found['fp'] + found['fn']
-    whole = found.loc[(scores.methods[0], ALL), 'errors']
-    found['share_of_errors'] = ratio(found['errors'], whole)
-    found = found[['points', 'errors', 'share_of_errors', 'precision', 'recall', 'iou']]
-    table = beside(found, scores, 'iou').loc[[*metrics.RING_TITLES, ALL]]
-    title = 'IoU'
-    if peer := scores.peer:
-        parts = dict(iter(rows.groupby('range')))
-        table['interval'] = [interval_text(scores, peer, IOU, parts[band]) for band in table.index]
-        title = f'IoU minus that of {peer}, {interval_note(scores)},'
-    title += ' by horizontal range (GroundGrid convention) [%]'
-    return Table(title, table.reset_index())
-
-
-def _object_table(scores: Scores) -> Table:
-    """Lay out what of objects each method calls ground, by class and range."""
-    rows = with_all(scores.objects, 'range')
-    parts = dict(iter(rows.groupby(['class', 'range'])))
-    places = [
-        place for name in objects.CLASSES for band in (*objects.BAND_TITLES, ALL)
-        if (place := (name, band)) in parts
-    ]  # fmt: skip
-    found = measured(rows, 'class', 'range')
-    found['n_lost'] = found['n_lost'].where(found['n_objects'] > 0)
-    found = found[['n_returns', 'share_ground', 'n_objects', 'n_lost']]
-    table = beside(found, scores, 'share_ground', 'n_lost').loc[places]
-    title = 'Objects: returns on them, and the share called ground [%]; objects, and those lost'
-    if peer := scores.peer:
-        ground = MEASURES['share_ground']
-        table['interval'] = [interval_text(scores, peer, ground, parts[k]) for k in places]
-        title += peer_note(scores, f'; of the share as ground: {interval_note(scores)}')
-    return Table(title, table.reset_index())
+    The measure `interval` has one of the difference to the peer.
+    """
+    rows = with_all(frame, by[-1])
+    found = measured(rows, *by)
+    if 'n_lost' in found:
+        found['n_lost'] = found['n_lost'].where(found['n_objects'] > 0)
+    table = beside(found[[name for name in columns if name in found]], scores, *compared)
+    table = table.reset_index()
+    if by[0] == 'class':
+        order = [*objects.CLASSES].index
+        table = table.sort_values('class', key=lambda own: own.map(order), kind='stable')
+    title += peer_note(scores)
+    if interval and scores.peer:
+        groups = [rows.merge(table.loc[[k], by]) for k in table.index]
+        measure = MEASURES[interval]
+        table['interval'] = [interval_text(scores, scores.peer, measure, own) for own in groups]
+        title += f'; {COMPARED[interval].removesuffix(" [%]")}: {interval_note(scores)}'
+    return Table(title, table)
 
 
 def difference_table(scores: Scores) -> Table:
