@@ -256,21 +256,12 @@ class GroundSurface(NamedTuple):
     std: FloatArray  # (M, K) its standard deviation [m]; NaN in the same places
     inlier: BoolArray  # (C,) candidates that the surface rests on
 
-    @usual_errors()
-    def at(self, grid: PolarGrid) -> tuple[FloatArray, FloatArray]:
-        """Height and standard deviation [m] under each point, two (N,) float64.
-
-        Linear between the knots; nearer than the first knot it is the first
-        knot's. NaN beyond the last knot and in segments without a model.
-        """
-        mean, std = (at_points(self.knots, table, grid) for table in (self.mean, self.std))
-        return mean, std
-
 
 def at_points(knots: FloatArray, table: FloatArray, grid: PolarGrid) -> FloatArray:
-    """Value under each point, (N,) float64, as `GroundSurface.at` gives it.
+    """Value under each point, (N,) float64.
 
-    `knots` (K,) are ranges [m], `table` (M, K) the values there.
+    `knots` (K,) are ranges [m], `table` (M, K) the values there, linear between the knots; nearer
+    than the first knot it is the first knot's. NaN beyond the last knot.
     """
     level, slope = linear_pieces(knots, table)
     cell = as_index(grid.cell)  # where it is negative, the value does not matter

@@ -232,9 +232,12 @@ def _begin_turn(folder: Path) -> None:
 
 def _end_turn() -> None:
     """Let another process compile."""
+    global _turn
     if _turn is not None:
         with contextlib.suppress(OSError):
-            fcntl.flock(_turn, fcntl.LOCK_UN)
+            fcntl.flock(_turn, fcntl.LOCK_UN)  # a forked process may have it open
+        _turn.close()
+        _turn = None
 
 
 def _log_not_kept(reason: Exception) -> None:

@@ -143,7 +143,7 @@ class GroundSegmenter:
                 x, y, z = _finite_numbers('origin', origin, 3)
                 sensor = dataclasses.replace(sensor, origin_x=x, origin_y=y, origin_z=z)
             if not (fallback is None or isinstance(fallback, SensorPose)):
-                raise ConfigError(f'fallback = {_shortened(fallback)}: must be a SensorPose')
+                raise _refused('fallback', fallback, 'a SensorPose')
             xyz = take_points(points, (sensor.origin_x, sensor.origin_y, sensor.origin_z))
             box = self._config.input.crop_box
             if box != NO_BOX:
@@ -323,7 +323,7 @@ def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[flo
         are_numbers = all(isinstance(v, Real) and not isinstance(v, bool) for v in given)
         if are_numbers and len(given) == count and all(map(math.isfinite, given)):
             return tuple(map(float, given))
-    raise ConfigError(f'{name} = {_shortened(values)}: must be {count} finite numbers')
+    raise _refused(name, values, f'{count} finite numbers')
 
 
 def _checked_frame(
@@ -336,13 +336,12 @@ def _checked_frame(
         turn, move = (np.asarray(part, dtype=np.float64) for part in frame)
         if (turn.shape, move.shape) == ((3, 3), (3,)) and np.isfinite([*turn, move]).all():
             return turn, move
-    raise ConfigError(
-        f'box_frame = {_shortened(frame)}: must be a rotation (3, 3) and a translation (3,)'
-    )
+    raise _refused('box_frame', frame, 'a rotation (3, 3) and a translation (3,)')
 
 
-def _shortened(value: object) -> str:
-    return textwrap.shorten(repr(value), 100, placeholder=' ...')
+def _refused(name: str, value: object, wanted: str) -> ConfigError:
+    shown = textwrap.shorten(repr(value), 100, placeholder=' ...')
+    return ConfigError(f'{name} = {shown}: must be {wanted}')
 
 
 def warm_up(config: Config | None = None) -> Backend:

@@ -38,7 +38,7 @@ FILES = {
     HEAD + '  label: [ {a\n': 'd.yaml: not valid YAML',
     '/**:\n\tros__parameters:\n': 'd.yaml: not valid YAML',
     HEAD + '    grid: {n_bins: 40}\n    grid: {n_bins: 50}\n': 'd.yaml: grid: given twice',
-    '\xff\xfe\0\x80': "d.yaml: 'utf-8' codec can't decode",
+    '\xff\xfe\0\x80': 'd.yaml: not a text file',
 }
 WORDS = {
     '--params-file nowhere.yaml': 'error: nowhere.yaml: No such file',
