@@ -37,9 +37,8 @@ def to_markdown_table() -> str:
     for spec in parameter_specs():
         if spec.basic:
             name, default = f'`{spec.name}`', f'`{yaml_scalar(spec.default)}`'
-            accepted = f'{spec.accepted_briefly} {spec.unit}'.rstrip()
             symbol = f' (`{spec.symbol}`)' if spec.symbol else ''
-            rows.append((name, default, accepted, f'{spec.description}{symbol}'))
+            rows.append((name, default, spec.accepted, f'{spec.description}{symbol}'))
     lines = ['| ' + ' | '.join(cell.replace('|', r'\|') for cell in row) + ' |' for row in rows]
     return '\n'.join(lines) + '\n'
 
@@ -62,39 +61,36 @@ def with_table(readme: str, name: str, table: str) -> str:
     return f'{head}{begin}\n{table}{end}{tail}'
 
 
-def rows_below(page: str, title: str) -> list[list[str]]:
-    """Cells of the rows of the first table below a title of a page."""
+def rows_below(page: str, title: str) -> dict[str, dict[str, str]]:
+    """Rows of the first table below a title of a page, by their first cell, by title of column."""
     text = (ROOT / page).read_text(encoding='utf-8')
     below = text[text.index(f'\n{title}') :].partition('\n|')[2].partition('\n\n')[0]
-    _, _, *rows = f'|{below}'.splitlines()
-    return [[cell.strip() for cell in row.split('|')[1:-1]] for row in rows]
+    titles, _, *rows = ([cell.strip() for cell in line.split('|')] for line in below.splitlines())
+    return {row[1]: dict(zip(titles, row[1:-1], strict=False)) for row in rows}
 
 
-GAINS = {
-    'all, GroundGrid convention': 'IoU, vegetation left out',
-    '40-50 m': 'IoU at 40 to 50 m',
-}
-"""Rows of the IoU, by the points that count."""
-PERFORMANCE = 'docs/performance.md'
+GAINS = {'all': 'IoU, vegetation left out', '40-50 m': 'IoU at 40 to 50 m'}
+"""Rows of the IoU, by horizontal range."""
 
 
 def to_scores_table() -> str:
     """Write a table of the scores of docs/accuracy.md and the times of docs/performance.md."""
     page = 'docs/accuracy.md'
     rows = [['Measure', 'gp_ground_seg', 'Patchwork++', 'Difference (95 % interval)'], ['---'] * 4]
-    gains = {points: cells for points, *cells in rows_below(page, 'IoU minus that of ')}
-    for points, title in GAINS.items():
-        ours, peer, gain, interval = gains[points]
-        rows.append([title, f'{ours} %', f'{peer} %', f'{gain} ({interval})'])
-    objects = rows_below(page, 'Objects: ')
-    ((*_, number, ours, peer),) = (row for row in objects if row[:2] == ['vehicle', 'all'])
-    rows.append([f'vehicles lost, of {number}', ours, peer, ''])
-    *_, (_, number, ours, peer, *_) = rows_below(page, 'Low things and false cells')
-    title = f'low things: returns called ground, of {number}'
-    rows.append([title, f'{ours} %', f'{peer} %', ''])
-    times = {method: cells for method, *cells in rows_below(PERFORMANCE, 'Time per frame')}
-    (ours, _, ratio, _), (peer, *_) = times['learning'], times['Patchwork++']
-    rows.append(['time per frame, median', f'{ours} ms', f'{peer} ms', f'{ratio} times'])
+    gains = rows_below(page, 'IoU minus that of ')
+    for place, title in GAINS.items():
+        row = gains[place]
+        gain = f'{row["difference"]} ({row["95 % interval"]})'
+        rows.append([title, f'{row["IoU"]} %', f'{row["peer IoU"]} %', gain])
+    row = rows_below(page, 'Objects: ')['vehicle']
+    rows.append([f'vehicles lost, of {row["objects"]}', row['lost'], row['peer lost'], ''])
+    row = rows_below(page, 'Low things and false cells')['all']
+    title = f'low objects: returns called ground, of {row["low returns"]}'
+    rows.append([title, f'{row["as ground"]} %', f'{row["peer as ground"]} %', ''])
+    times = rows_below('docs/performance.md', 'Time per frame')
+    ours, peer = times['learning'], times['Patchwork++']
+    title, ratio = 'time per frame, median', f'{ours["/ Patchwork++"]} times'
+    rows.append([title, f'{ours["median [ms]"]} ms', f'{peer["median [ms]"]} ms', ratio])
     return ''.join(f'| {" | ".join(row)} |\n' for row in rows)
 
 
@@ -105,8 +101,7 @@ def generated_files(readme: str) -> dict[str, str]:
     DataError as `with_table`.
     """
     files = {
-        f'config/{preset.name}.yaml': preset.config.to_yaml(preset.title, preset.reasons)
-        for preset in PRESETS.values()
+        f'config/{preset.name}.yaml': preset.to_yaml(preset.config) for preset in PRESETS.values()
     }
     files[README] = with_table(readme, SCORES, to_scores_table())
     files['docs/parameters.md'] = PAGE_HEAD + to_markdown_table() + ALL_PARAMETERS

@@ -56,17 +56,17 @@ def main(path: str) -> int:
         f'raw cloud, {LOW:g} to {HIGH:g} m up': (up >= LOW) & (up <= HIGH),
         'obstacles of gp_ground_seg': SegmentedCloud(None, result, config).is_obstacle,
     }
-    thing = cells_of(xy, ~scan.is_ground)
-    ground = cells_of(xy, scan.is_ground) & ~thing
+    objects = cells_of(xy, ~scan.is_ground)
+    ground = cells_of(xy, scan.is_ground) & ~objects
     figure, said = new_figure(2.0 * SIDE + 0.2, SIDE + 0.7), []
     for k, (title, points) in enumerate(chosen.items()):
         marked = cells_of(xy, points)
-        layers = {'ground': ground & ~marked, 'obstacle': thing & marked}
+        layers = {'ground': ground & ~marked, 'obstacle': objects & marked}
         layers['false ground'] = ground & marked
         draw(figure, k * (SIDE + 0.2), title, layers)
         numbers = [in_thousands(layers[name].sum()) for name in ('false ground', 'obstacle')]
-        said.append(f'marks {numbers[0]} of ground, {numbers[1]} of things')
-    names = {'ground': 'ground', 'thing, marked': 'obstacle', 'ground, marked': 'false ground'}
+        said.append(f'marks {numbers[0]} of ground, {numbers[1]} of objects')
+    names = {'ground': 'ground', 'object, marked': 'obstacle', 'ground, marked': 'false ground'}
     dots = [
         Line2D(
             [], [], marker='o', markersize=7, color=COLOURS[name], linestyle='none', label=shown
@@ -75,9 +75,9 @@ def main(path: str) -> int:
     ]
     figure.legend(handles=dots, loc='lower center', fontsize=11, frameon=False, ncols=3)
     save(figure, path)
-    n_ground, n_things = (in_thousands(cells.sum()) for cells in (ground, thing))
+    n_ground, n_objects = (in_thousands(cells.sum()) for cells in (ground, objects))
     print(
-        f'{n_ground} cells of ground, {n_things} of things: the raw cloud {said[0]}; '
+        f'{n_ground} cells of ground, {n_objects} of objects: the raw cloud {said[0]}; '
         f'gp_ground_seg {said[1]}, written to {path}'
     )
     return 0

@@ -81,10 +81,7 @@ class HeightRule:
     def result(self) -> MethodResult:
         label = np.where(self.points[:, 2] < self.height, Label.GROUND, Label.OBSTACLE)
         surface = np.full(len(self.points), self.height)
-        return MethodResult(label.astype(np.uint8), surface, self.probability())
-
-    def probability(self) -> np.ndarray | None:
-        return None
+        return MethodResult(label.astype(np.uint8), surface)
 
 
 def write_two_drives(folder):

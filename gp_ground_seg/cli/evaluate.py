@@ -15,41 +15,39 @@ from gp_ground_seg.core.parameters.config import config_of
 from gp_ground_seg.data.inputs import Input, list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame, is_root, labelled_frames
 from gp_ground_seg.lab.cluster import Runner
-from gp_ground_seg.lab.scoring import report as results
 from gp_ground_seg.lab.scoring import tables
 from gp_ground_seg.lab.scoring.evaluate import (
-    PATCHWORKPP,
     KnownScan,
     Method,
     OurMethod,
     Scores,
     load_kitti,
     score_methods,
-    title_of,
 )
 from gp_ground_seg.lab.scoring.objects import CUT_HEIGHT
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
+from gp_ground_seg.lab.scoring.report import (
+    Report,
+    changed_parameters,
+    describe_environment,
+    machine_line,
+)
 
 DESCRIPTION = """\
 Segment labelled frames and score the labels in the GroundGrid convention, which leaves
-vegetation out: precision, recall, F1, accuracy, IoU, time per frame. Count vehicles, persons
-and cyclists that are lost: the share of their returns from 0.3 m above the local ground that
-is labelled ground, and the objects with more than half of these returns labelled ground.
-Objects are the instances of the labels (their upper 16 bits). The last line is the result.
+vegetation out: precision, recall, IoU, heights, time per frame. Count the vehicles, persons and
+cyclists that are lost: of their returns from 0.3 m above the ground more than half are called
+ground. Objects are the instances of the labels (their upper 16 bits). Count low things, which
+are objects cut at --cut, and false cells, where ground is taken for an obstacle. docs/accuracy.md
+says how. The last line is the result.
 
-Low things: the returns of vehicles, persons and cyclists more than --cut above the ground are
-taken out, and what is left, as low as a parcel, is segmented in a second run, which does not
-count in the times. The share of the low returns that is labelled ground is reported. False
-cells: the share of the cells of 0.1 m of road, and of ground, in which a return of it is
-labelled obstacle, 0.15 m or more over the surface. Patchwork++ has no such heights.
+With --against a second set of parameters, or with --peer Patchwork++, runs in turns on the same
+frames. Each difference has a bootstrap interval over the sequences, or over blocks of frames of
+a single one; in a tie it holds 0. With --against, ROOT may also be scans without labels, such
+as a folder or a bag: the tables have the points with two labels, and the time.
 
-With --against a second set of parameters, or with --peer Patchwork++, runs in turns on
-the same frames. Each difference has a bootstrap interval over the sequences, or over blocks of
-frames of a single one; in a tie it holds 0. With --against ROOT may also be scans without
-labels, such as a folder or a bag: the tables have the points with two labels, and the time.
-
-Patchwork++ has its published parameters. If you give the height or the place of the sensor
-(sensor.height, sensor.origin_x, ...), it gets them too.
+Patchwork++ has its published parameters, and the height and the place of the sensor where they
+are given (sensor.height, sensor.origin_x, ...).
 """
 EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT
@@ -81,18 +79,14 @@ CUT = (
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
     parser = options.new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
-    peer = f'compare with this method: {PATCHWORKPP} (pip install pypatchworkpp)'
+    peer = 'compare with this method: patchworkpp (pip install pypatchworkpp)'
+    options.add(parser, ROOT, *OF_FRAMES, CUT)
     options.add(
-        parser,
-        ROOT,
-        *OF_FRAMES,
-        CUT,
+        parser.add_mutually_exclusive_group(),
         ('--against', 'compare with this parameter file or preset', {'metavar': 'NAME'}),
-        ('--peer', peer, {'choices': [PATCHWORKPP], 'metavar': 'METHOD'}),
-        options.MARKDOWN,
-        options.TO_JSON,
-        options.FORCE,
+        ('--peer', peer, {'choices': ['patchworkpp'], 'metavar': 'METHOD'}),
     )
+    options.add(parser, options.MARKDOWN, options.TO_JSON, options.FORCE)
     options.add_cluster(parser)
     options.add_config(parser)
     parser.set_defaults(run=run)
@@ -104,57 +98,51 @@ def run(arguments: argparse.Namespace) -> int:
     cut = CUT_HEIGHT if arguments.cut is None else float(arguments.cut)
     changed: list[str] = []
     methods: list[Method] = [OurMethod(config)]
+    if arguments.peer is not None:
+        methods.append(PatchworkppMethod.of_sensor(config.sensor))
     if arguments.against is not None:
         other = config_of(arguments.against)
-        changed = options.changed_lines(other, config)
         methods.append(OurMethod(other, shown(Path(arguments.against).name)))
-        if arguments.peer is not None:
-            raise ConfigError(
-                '--against: compares with parameters, --peer with a method; give one'
-            )
+        changed = options.changed_lines(other, config)
         if not changed:
             raise ConfigError(f'--against {arguments.against}: the same parameters as given')
-    elif arguments.peer is not None:
-        methods.append(PatchworkppMethod.of_sensor(config.sensor))
+    result: list[str] = []
 
-    def measured(runner: Runner) -> results.Report:
+    def measured(runner: Runner) -> Report:
         items, load = _items(arguments, cut)
         scores = score_methods(items, methods, load, runner=runner)
         if changed:
             print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
-        report = tables.evaluation(scores, config, runner.n_workers)
-        report.facts.update(data=arguments.root, cut=cut)
-        parameters = results.parameters_line(report.facts['config_changes'])
-        result[:] = [parameters, *_result_lines(scores)]
-        return report
+        result.extend(_result_lines(scores))
+        return tables.evaluation(scores, config)
 
-    result: list[str] = []
     packages = ['pypatchworkpp'] if arguments.peer else []
-    print_report(arguments, 'evaluate', measured, packages)
-    print('', *result, sep='\n')
+    print_report(arguments, 'evaluate', measured, packages, data=arguments.root, cut=cut)
+    changes = [f'{name}={value}' for name, value in changed_parameters(config).items()]
+    print('', f'parameters: {", ".join(changes) or "defaults"}', *result, sep='\n')
     return 0
 
 
 def print_report(
     arguments: argparse.Namespace,
     title: str,
-    measured: Callable[[Runner], results.Report],
+    measured: Callable[[Runner], Report],
     packages: Sequence[str],
+    **facts: Any,
 ) -> None:
     """Measure with the runner of the options, write ``--json``, and print the tables.
 
-    The versions of `packages` are recorded.
+    The versions of `packages` are recorded, and the `facts`.
     """
     if arguments.markdown:
         require('tabulate', 'tabulate')
     with options.staged_json(arguments) as path:
         with options.runner(arguments, title) as runner:
             report = measured(runner)
-        environment = results.describe_environment(*packages)
-        environment['n_workers'] = runner.n_workers
+        environment = {**describe_environment(*packages), 'n_workers': runner.n_workers}
         if path is not None:
-            report.write(path, environment)
-    machine = results.machine_line(environment, report.backend)
+            report.write(path, environment, **facts)
+    machine = machine_line(environment, report.backend)
     print(report.text(machine, markdown=arguments.markdown))
 
 
@@ -195,7 +183,7 @@ def _result_lines(scores: Scores) -> list[str]:
             words += [f'{title} {100.0 * own[key]:.2f} %' for title, key in titles.items()]
         if own.get('n_objects'):
             words.append(f'{own["n_lost"]:.0f} of {own["n_objects"]:.0f} objects lost')
-        lines.append(f'{title_of(name)}: {", ".join(words)}, {1e3 * medians[name]:.1f} ms')
+        lines.append(f'{name}: {", ".join(words)}, {1e3 * medians[name]:.1f} ms')
     counted = options.count(int(pooled['n_scans'].iloc[0]), 'frame')
     counted += f' of {options.count(len(scores.sequences), "sequence")}'
     return [f'{counted}; GroundGrid convention; median time of a frame', *lines]

@@ -75,11 +75,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         source = ' KITTI_ROOT' if experiment.labelled else ' --sensors vlp-16'
         example = f'  gp-ground-seg experiment {name}{source} --json {name}.json'
         purpose = description.splitlines()[0].removesuffix('.')
-        if experiment.takes_config:
-            description += (
-                '\n\nWhat it compares it sets itself, over --preset, --config and --set.'
-            )
         child = options.new_parser(names, name, f'{description}\n', example, purpose)
+        # What is not asked for: no labelled frames, no simulated scans, one process.
+        child.set_defaults(run=run, root=None, simulated=not experiment.labelled)
+        child.set_defaults(workers=None, scheduler=None)
         if experiment.labelled:
             count = {'nargs': '?'} if experiment.sensors else {}
             options.add(child, (*ROOT[:2], {**ROOT[2], **count}), *OF_FRAMES)
@@ -97,25 +96,22 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                 options.add(child, (option, text, kind))
         options.add(child, *[NO_PEER] * experiment.has_peer)
         options.add(child, options.MARKDOWN, options.TO_JSON, options.FORCE)
-        if experiment.is_timed:
-            child.set_defaults(workers=None, scheduler=None)
-        else:
+        if not experiment.is_timed:
             options.add_cluster(child)
         if experiment.takes_config:
             options.add_config(child)
-        child.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, write the file, print the tables."""
-    experiment = EXPERIMENTS[arguments.experiment]
-    is_simulated = getattr(arguments, 'simulated', not experiment.labelled)
-    if experiment.labelled and is_simulated == (arguments.root is not None):
-        raise DataError(f'{arguments.experiment}: give either ROOT or --simulated')
-    for name in ('sequences', 'frame_step') if is_simulated else ('sensors', 'scenes', 'seeds'):
-        if getattr(arguments, name, None) is not None:
-            option = name.replace('_', '-')
-            raise DataError(f'--{option}: is for the other kind of scans, see --simulated')
+    name, experiment = arguments.experiment, EXPERIMENTS[arguments.experiment]
+    if arguments.simulated == (arguments.root is not None):
+        raise DataError(f'{name}: give either ROOT or --simulated')
+    others = ('sequences', 'frame_step') if arguments.simulated else ('sensors', 'scenes', 'seeds')
+    for option in others:
+        if vars(arguments).get(option) is not None:
+            words = option.replace('_', '-')
+            raise DataError(f'--{words}: is for the other kind of scans, see --simulated')
     config = options.read_config(arguments) if experiment.takes_config else Config()
     measure: Callable[..., Report] = experiment.run
     with_peer = experiment.has_peer and not arguments.no_peer
@@ -123,19 +119,16 @@ def run(arguments: argparse.Namespace) -> int:
         measure = partial(measure, with_peer=with_peer)
 
     def measured(runner: Runner) -> Report:
-        if is_simulated:
-            scans: Sequence[Any] = simulated_frames(
-                arguments.sensors or experiment.sensors,
-                arguments.scenes or experiment.scenes,
-                arguments.seeds or experiment.n_seeds,
-                experiment.places,
-            )
-        else:
-            scans = frames_from_options(arguments)
-        report = measure(scans, config, runner)
-        report.facts.update(experiment=arguments.experiment)
-        return report
+        if not arguments.simulated:
+            return measure(frames_from_options(arguments), config, runner)
+        scans: Sequence[Any] = simulated_frames(
+            arguments.sensors or experiment.sensors,
+            arguments.scenes or experiment.scenes,
+            arguments.seeds or experiment.n_seeds,
+            experiment.places,
+        )
+        return measure(scans, config, runner)
 
     packages = ['pypatchworkpp'] * with_peer
-    print_report(arguments, arguments.experiment, measured, packages)
+    print_report(arguments, name, measured, packages, experiment=name)
     return 0

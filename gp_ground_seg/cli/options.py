@@ -61,7 +61,7 @@ def new_parser(
     )
 
 
-def add(parser: argparse.ArgumentParser, *options: tuple[str, str, dict[str, Any]]) -> None:
+def add(parser: argparse._ActionsContainer, *options: tuple[str, str, dict[str, Any]]) -> None:
     """Add options: names, help, and what else `add_argument` takes."""
     for names, text, more in options:
         parser.add_argument(*names.split(), help=text, **more)
@@ -116,7 +116,7 @@ def refuse_columns(arguments: argparse.Namespace, source: object) -> None:
 def add_cluster(parser: argparse.ArgumentParser) -> None:
     """Add ``--workers N`` and ``--scheduler ADDRESS``."""
     add(
-        parser,
+        parser.add_mutually_exclusive_group(),
         ('--workers', 'compute in N processes of this machine', NUMBER),
         ('--scheduler', 'compute on the Dask cluster of this scheduler, as in tcp://HOST:8786',
          {'metavar': 'ADDRESS'}),
@@ -125,11 +125,8 @@ def add_cluster(parser: argparse.ArgumentParser) -> None:
 
 def runner(arguments: argparse.Namespace, title: str) -> AbstractContextManager[Runner]:
     """Return a runner of blocks of frames by the options of `add_cluster`, with a bar."""
-    workers, scheduler = arguments.workers, arguments.scheduler
-    if workers and scheduler:
-        raise DataError('--workers: the cluster of --scheduler has workers, give one of the two')
     bar = progress(title, quiet=getattr(arguments, 'quiet', False))
-    return open_runner(workers, scheduler, bar)
+    return open_runner(arguments.workers, arguments.scheduler, bar)
 
 
 def above_zero(text: str, *, or_zero: bool = False) -> float:
@@ -142,19 +139,6 @@ def above_zero(text: str, *, or_zero: bool = False) -> float:
         least = 'at least 0' if or_zero else 'above 0'
         raise argparse.ArgumentTypeError(f'{text!r}: must be a number, {least}')
     return number
-
-
-def one_of(known: Iterable[str]) -> Callable[[str], str]:
-    """Return the type of one of the `known` names."""
-    names = list(known)
-
-    def parse(word: str) -> str:
-        if word not in names:
-            hint = did_you_mean(word, names)
-            raise argparse.ArgumentTypeError(f'{word!r}: must be one of {", ".join(names)}{hint}')
-        return word
-
-    return parse
 
 
 def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:

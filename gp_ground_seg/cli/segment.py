@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
+from collections.abc import Sequence
 from contextlib import closing
-from functools import partial, reduce
+from functools import partial
+from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 
@@ -14,12 +15,13 @@ from gp_ground_seg import __version__
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
-from gp_ground_seg.data.cloud_files import FORMATS, LABELS, format_for, read_file
+from gp_ground_seg.data.cloud_files import FORMATS, LABELS, format_for
 from gp_ground_seg.data.files import check_writable
-from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
-from gp_ground_seg.data.semantic_kitti import is_root, list_frames, list_sequences
+from gp_ground_seg.data.inputs import Inputs, holds_bag, list_inputs
+from gp_ground_seg.data.semantic_kitti import is_root, list_sequences
 from gp_ground_seg.lab.dataset import (
     PARAMETERS,
     Item,
@@ -71,7 +73,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
          {'metavar': 'OUT'}),
         ('--format', 'of the output (default: by the name of OUT, else labels of .bin scans, and '
          f'as the input; mcap for ROS 1): {", ".join(formats)}',
-         {'type': options.one_of(formats), 'metavar': 'FORMAT'}),
+         {'choices': formats, 'metavar': 'FORMAT'}),
         *options.CLOUDS,
         options.FORCE,
         options.QUIET,
@@ -117,13 +119,16 @@ def _segment_scans(target: Path, arguments: argparse.Namespace, config: Config) 
         return
     if is_single and target.suffix and not target.is_dir():
         raise DataError(f'{target}: must be a folder, or end in .{", .".join(FORMATS)}')
-    names = [f'{scan.name}.{format_for(scan.path, form)}' for scan in scans]
+    _segment_into(target, _list_items(scans, form), arguments, config)
+
+
+def _list_items(scans: Inputs, form: str | None, folder: str = '') -> list[Item]:
+    """List scans, which become files in a folder of the output; a bag is one item."""
+    names = [f'{folder}{scan.name}.{format_for(scan.path, form)}' for scan in scans]
     if scans.topic:
-        items = [Item(source, names, partial(write_scans, scans, names), len(scans))]
-    else:
-        pairs = zip(scans, names, strict=True)
-        items = [Item(s.path, [name], partial(write_scans, [s], [name])) for s, name in pairs]
-    _segment_into(target, items, arguments, config)
+        return [Item(scans.path, names, partial(write_scans, scans, names), len(scans))]
+    pairs = zip(scans, names, strict=True)
+    return [Item(s.path, [name], partial(write_scans, [s], [name])) for s, name in pairs]
 
 
 def _segment_to(target: Path, item: Item, arguments: argparse.Namespace, config: Config) -> None:
@@ -138,8 +143,7 @@ def _segment_to(target: Path, item: Item, arguments: argparse.Namespace, config:
     bar = options.progress('segment', quiet=arguments.quiet)
     used = options.spare_compiling(config, item.n_clouds)
     results = item.write(GroundSegmenter(used), target.parent)
-    outcome = Outcome.of(bar(results, total=item.n_clouds))
-    _print_summary(outcome, target)
+    _print_summary([*map(Outcome.of, bar(results, total=item.n_clouds))], target)
     if not arguments.quiet:
         options.note_spared(config, used)
 
@@ -173,7 +177,7 @@ def _segment_into(
         with options.runner(arguments, 'segment') as runner:
             output.begin(force=force)
             outcomes = runner.run(compute, left, group, count_clouds)
-    _print_summary(reduce(Outcome.joined, outcomes), folder, runner.n_workers)
+    _print_summary([*chain(*outcomes)], folder, runner.n_workers)
     if not arguments.quiet:
         options.note_spared(config, used)
 
@@ -181,10 +185,8 @@ def _segment_into(
 def _source(arguments: argparse.Namespace) -> Path:
     """Return where the inputs are: the same names from elsewhere are other inputs."""
     source = Path(arguments.input).resolve()
-    if arguments.more:
-        parents = [str(Path(path).resolve().parent) for path in (source, *arguments.more)]
-        return Path(os.path.commonpath(parents))
-    return source if holds_bag(source) or source.is_dir() else source.parent
+    is_whole = not arguments.more and (holds_bag(source) or source.is_dir())
+    return source if is_whole else source.parent
 
 
 def _list_root(arguments: argparse.Namespace) -> list[Item]:
@@ -194,11 +196,8 @@ def _list_root(arguments: argparse.Namespace) -> list[Item]:
         raise DataError(f'--format {arguments.format}: a KITTI_ROOT gives .label files')
     items = []
     for sequence in list_sequences(arguments.input):
-        for frame in list_frames(arguments.input, sequence, columns):
-            path = frame.points_path
-            scan = Input(str(frame), shown(path.name), path, partial(read_file, path, columns))
-            names = [f'sequences/{sequence}/predictions/{frame.index}.{LABELS}']
-            items.append(Item(path, names, partial(write_scans, [scan], names)))
+        scans = list_inputs(Path(arguments.input, 'sequences', sequence), columns)
+        items += _list_items(scans, LABELS, f'sequences/{sequence}/predictions/')
     return items
 
 
@@ -235,37 +234,39 @@ def _default_output(source: Path, form: str | None = None) -> Path:
     return named.with_name(f'{named.stem}_ground{suffix}')
 
 
-def _print_summary(found: Outcome, target: Path, n_workers: int = 0) -> None:
+def _print_summary(found: Sequence[Outcome], target: Path, n_workers: int = 0) -> None:
     """Print points, ground, time, and height and tilt of the sensor."""
-    seconds = found.seconds
-    share = f'{found.n_ground / found.n_points:.1%} ground' if found.n_points else 'no ground'
+    seconds = [one.seconds for one in found]
+    n_points, n_ground = sum(one.n_points for one in found), sum(one.n_ground for one in found)
+    share = f'{n_ground / n_points:.1%} ground' if n_points else 'no ground'
     pace = f'{1e3 * statistics.median(seconds[1:] or seconds):.1f} ms'
     pace += ' per frame (median' if len(seconds) > 1 else ' for the first frame (with loading code'
     beside = f' in each of {options.count(n_workers, "worker")}' if n_workers else ''
     print(
-        f'{options.count(len(seconds), "frame")}, {options.count(found.n_points, "point")}, '
+        f'{options.count(len(found), "frame")}, {options.count(n_points, "point")}, '
         f'{share}, {pace}, segmentation only){beside}, written to {shown(target)}'
     )
-    if seconds:
-        print(_pose_summary(found))
-    if found.contradictions:
-        n_frames = options.count(len(found.contradictions), 'frame')
-        print(f'{shown(found.contradictions[0])} ({n_frames}: docs/pose.md)')
+    if found:
+        print(_pose_summary([one.measured for one in found if one.measured is not None]))
+    if contradictions := [text for one in found for text in one.contradictions]:
+        n_frames = options.count(len(contradictions), 'frame')
+        print(f'{shown(contradictions[0])} ({n_frames}: docs/pose.md)')
 
 
-def _pose_summary(found: Outcome) -> str:
+def _pose_summary(poses: Sequence[MeasuredPose]) -> str:
     """Median and standard deviation over the scans that show the pose, as parameters."""
-    if not found.heights:
+    heights = [pose.height for pose in poses if pose.tells_height]
+    if not heights:
         return 'no frame shows enough ground to estimate the height of the sensor'
-    rolls, pitches = zip(*found.tilts, strict=True) if found.tilts else ((), ())
+    tilted = [pose for pose in poses if pose.tells_tilt]
     words = []
     for name, values, digits, unit in (
-        ('height', found.heights, 2, 'm'),
-        ('roll', rolls, 3, 'rad'),
-        ('pitch', pitches, 3, 'rad'),
+        ('height', heights, 2, 'm'),
+        ('roll', [pose.roll for pose in tilted], 3, 'rad'),
+        ('pitch', [pose.pitch for pose in tilted], 3, 'rad'),
     ):
         if not values:
             continue
         spread = f' (std {statistics.stdev(values):.{digits}f})' if len(values) > 1 else ''
         words.append(f'sensor.{name}={statistics.median(values):.{digits}f}{spread} {unit}')
-    return f'measured in {options.count(len(found.heights), "frame")}: {", ".join(words)}'
+    return f'measured in {options.count(len(heights), "frame")}: {", ".join(words)}'

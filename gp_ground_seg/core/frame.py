@@ -158,16 +158,9 @@ class Candidates(NamedTuple):
     @classmethod
     def buffers(cls, n: int, n_segments: int) -> Candidates:
         """Arrays for at most `n` candidates, with arbitrary content."""
-        return cls(
-            r=np.empty(n),
-            z=np.empty(n),
-            bin=np.empty(n, np.int64),
-            density=np.empty(n),
-            offsets=np.empty(n_segments + 1, np.int64),
-            tile=np.empty(n, np.int32),
-            x=np.empty(n),
-            y=np.empty(n),
-        )
+        r, z, density, x, y = (np.empty(n) for _ in range(5))
+        places, offsets = np.empty(n, np.int64), np.empty(n_segments + 1, np.int64)
+        return cls(r, z, places, density, offsets, np.empty(n, np.int32), x, y)
 
     def first(self, n: int) -> Candidates:
         """First `n`, to which `offsets` refer already."""
@@ -179,16 +172,8 @@ class Candidates(NamedTuple):
         return self._taken(kept, before[self.offsets])
 
     def _taken(self, kept: Any, offsets: IntArray) -> Candidates:
-        return Candidates(
-            self.r[kept],
-            self.z[kept],
-            self.bin[kept],
-            self.density[kept],
-            offsets,
-            self.tile[kept],
-            self.x[kept],
-            self.y[kept],
-        )
+        columns = self._asdict() | {'offsets': offsets}
+        return Candidates(**{k: v if k == 'offsets' else v[kept] for k, v in columns.items()})
 
 
 class Scan(NamedTuple):

@@ -10,7 +10,7 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
-from gp_ground_seg.core.errors import LOGGER, DataError, PointCloudError, shown
+from gp_ground_seg.core.errors import LOGGER, DataError, shown
 from gp_ground_seg.core.pipeline.points import take_points
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, METADATA_FILE
 from gp_ground_seg.data.bags import BagReader, decode_cloud
@@ -23,6 +23,7 @@ from gp_ground_seg.data.cloud_files import (
     read_file,
 )
 from gp_ground_seg.data.clouds import Cloud
+from gp_ground_seg.data.files import naming
 from gp_ground_seg.data.point_cloud2 import read_fields, read_xyz
 
 # Where the scans are in a sequence of SemanticKITTI or a root of nuScenes, and those sequences.
@@ -181,9 +182,7 @@ def _stem(path: Path) -> str:
 
 
 def _decode(raw: bytes, place: str) -> Cloud:
-    try:
+    with naming(place):
         message = decode_cloud(raw)
         # A cloud without points is one of a drive, and no error as a file of its own is.
         return Cloud(read_fields(message), take_points(read_xyz(message)))
-    except PointCloudError as error:
-        raise DataError(f'{place}: {error}') from error

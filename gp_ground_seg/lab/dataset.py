@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import operator
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -13,6 +12,7 @@ from typing import NamedTuple
 from gp_ground_seg.core.errors import DataError, PointCloudError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES
@@ -43,36 +43,20 @@ class Item(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Numbers of the segmented clouds: points, times, and what they show of the sensor's pose."""
+    """What is kept of a segmented cloud, for a summary."""
 
     n_points: int
     n_ground: int
-    seconds: list[float]  # of each cloud, segmentation only
-    heights: list[float]  # of the sensor, by the clouds that show it [m]
-    tilts: list[tuple[float, float]]  # roll and pitch, by the clouds that show them [rad]
-    contradictions: list[str]  # of the clouds that contradict a parameter
+    seconds: float  # segmentation only
+    measured: MeasuredPose | None  # what it shows of the sensor's pose
+    contradictions: Sequence[str]  # of it and a parameter
 
     @classmethod
-    def of(cls, results: Iterable[Segmentation]) -> Outcome:
-        """Sum up clouds, one by one."""
-        found = cls(0, 0, [], [], [], [])
-        for result in results:
-            n_ground = int((result.label == Label.GROUND).sum())
-            found = found._replace(
-                n_points=found.n_points + len(result.label), n_ground=found.n_ground + n_ground
-            )
-            found.seconds.append(result.timings['total'])
-            found.contradictions.extend(result.pose.contradictions)
-            measured = result.pose.measured
-            if measured is not None and measured.tells_height:
-                found.heights.append(measured.height)
-            if measured is not None and measured.tells_tilt:
-                found.tilts.append((measured.roll, measured.pitch))
-        return found
-
-    def joined(self, other: Outcome) -> Outcome:
-        """Put further clouds behind these."""
-        return Outcome(*map(operator.add, self, other))
+    def of(cls, result: Segmentation) -> Outcome:
+        """Count a result."""
+        label, pose = result.label, result.pose
+        n_ground, seconds = int((label == Label.GROUND).sum()), result.timings['total']
+        return cls(len(label), n_ground, seconds, pose.measured, pose.contradictions)
 
 
 def write_scans(
@@ -135,11 +119,11 @@ def write_bag(
 
 def segment_block(
     folder: Path, config: Config, items: Sequence[Item], progress: Progress
-) -> Outcome:
+) -> list[Outcome]:
     """Segment items into the files of a folder."""
     segmenter = GroundSegmenter(config)
     results = (result for item in items for result in item.write(segmenter, folder))
-    return Outcome.of(progress(results))
+    return [Outcome.of(result) for result in progress(results)]
 
 
 def count_clouds(items: Iterable[Item]) -> int:

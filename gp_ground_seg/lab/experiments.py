@@ -7,8 +7,7 @@ sets itself, over the parameters given.
 from __future__ import annotations
 
 import itertools
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gp_ground_seg.core.backend import make_backend
@@ -24,19 +23,23 @@ from gp_ground_seg.lab.scoring.evaluate import (
     OurMethod,
     Scores,
     score_methods,
-    title_of,
 )
 from gp_ground_seg.lab.scoring.peers import InterpolationMethod, PatchworkppMethod
-from gp_ground_seg.lab.scoring.report import Form, Report, Table, changed_parameters, frame_of
-from gp_ground_seg.lab.scoring.tables import (
-    FORMS,
-    MEASURES,
-    SHARE,
+from gp_ground_seg.lab.scoring.report import (
     SIGNED,
+    Form,
+    Report,
+    Table,
+    changed_parameters,
+    frame_of,
+)
+from gp_ground_seg.lab.scoring.tables import (
+    MEASURES,
     interval_note,
     interval_text,
     make_report,
     measured,
+    time_tables,
 )
 
 if TYPE_CHECKING:
@@ -84,25 +87,20 @@ MODES = {'every_frame': 'learning', 'fixed': 'theta fixed'}
 N_PASSES = 3
 """How often each frame is timed."""
 
-_FORMS = {**FORMS, 'iou': Form('IoU [%]', *SHARE), 'rmse': Form('RMSE [cm]', *SHARE)}
-_FORMS['median_absolute'] = Form('median [cm]', *SHARE)
-
 
 def score_variants(
     items: Sequence[Any],
     variants: Mapping[str, Config],
     peers: Sequence[Method] = (),
     runner: Runner = HERE,
-) -> Scores:
-    """Run variants, then `peers`, once on every scan, alternately, each scan without a past."""
+) -> tuple[Scores, DataFrame]:
+    """Run variants, then `peers`, once on every scan, alternately, each scan without a past.
+
+    Return the scores, and the measures of each method over all scans.
+    """
     ours = [OurMethod(config, name) for name, config in variants.items()]
-    return score_methods(items, [*ours, *peers], load_scan, each_alone=True, runner=runner)
-
-
-def by_method(scores: Scores) -> DataFrame:
-    """Return sums and measures of each method over all scans, and its title."""
-    found = measured(scores.scans)
-    return found.assign(method=[title_of(name) for name in found.index])
+    scores = score_methods(items, [*ours, *peers], load_scan, each_alone=True, runner=runner)
+    return scores, measured(scores.scans).reset_index()
 
 
 def _differences(
@@ -119,9 +117,12 @@ def _differences(
 
 
 def _counted(scores: Scores) -> str:
-    """Say of how many scans a table is."""
+    """Say of how many scans a table is, and in what units."""
     n_scans = len(scores.scans) // len(scores.methods)
-    return f'{n_scans} scans of {len(scores.sequences)} sequences'
+    return (
+        f'{n_scans} scans of {len(scores.sequences)} sequences; IoU [%], RMSE and median of the '
+        'height under true ground [cm]'
+    )
 
 
 def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) -> Report:
@@ -133,7 +134,7 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     ground of ``--scenes``, by exact labels and heights.
     """
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
-    scores = score_variants(items, variants, [InterpolationMethod(config)], runner)
+    scores, models = score_variants(items, variants, [InterpolationMethod(config)], runner)
     learned, lines = 'Z-L, learned', scores.methods[-1]
     pairs = [pair for pair in [*PAIRS, (learned, lines)] if {*pair} <= {*scores.methods}]
     how = [[name.partition(', ')[2] for name in pair if name in MODELS] for pair in pairs]
@@ -147,17 +148,16 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
         'iou_difference': Form('IoU', *SIGNED), 'iou_interval': Form('IoU, 95 % interval'),
         'rmse_difference': Form('RMSE', *SIGNED), 'rmse_interval': Form('RMSE, 95 % interval'),
     }  # fmt: skip
-    models = by_method(scores)[['method', 'iou', 'rmse', 'median_absolute']]
-    title = f'{_counted(scores)}; RMSE and median of the height under true ground'
     of_pairs = (
         'Differences of IoU [%], where more is better, and of RMSE [cm], where less is; '
         f'{interval_note(scores)}'
     )
+    models = models[['method', 'iou', 'rmse', 'median_absolute']]
     tables = {
-        'models': Table(title, models, _FORMS),
+        'models': Table(_counted(scores), models),
         'pairs': Table(of_pairs, rows, forms),
     }
-    return make_report(tables, scores, config, changes=MODELS)
+    return make_report(tables, scores, config)
 
 
 def paper_steps() -> dict[str, Config]:
@@ -180,17 +180,16 @@ def compare_steps(
     steps = paper_steps()
     peers: list[Method] = [InterpolationMethod(config)]
     peers += [PatchworkppMethod()] if with_peer else []
-    scores = score_variants(items, steps, peers, runner)
+    scores, table = score_variants(items, steps, peers, runner)
     names, last = scores.methods, [*steps][-1]
     above = [names[0], *names[: len(steps) - 1], *[last] * len(peers)]
-    table = by_method(scores)[['method', 'iou', 'rmse']]
     table = table.assign(**_differences(scores, 'iou', [*zip(names, above, strict=True)]))
     table = table[['method', 'iou', 'difference', 'interval', 'rmse']]
     title = (
-        f'{_counted(scores)}, each by itself; difference to the row above, below the steps to '
-        f'the last of them; {interval_note(scores)}; RMSE of the height under labelled ground'
+        f'{_counted(scores)}; difference to the row above, below the steps to the last of them; '
+        f'{interval_note(scores)}'
     )
-    return make_report({'steps': Table(title, table, _FORMS)}, scores, config)
+    return make_report({'steps': Table(title, table)}, scores, config)
 
 
 def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner = HERE) -> Report:
@@ -204,28 +203,21 @@ def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner =
         )
         for n in CANDIDATES_PER_PSEUDO_INPUT
     }
-    scores = score_variants(items, variants, runner=runner)
+    scores, table = score_variants(items, variants, runner=runner)
     n_inputs = scores.scans['n_pseudo_inputs'] / scores.scans['n_segments']
-    scans = scores.scans.assign(n_inputs=n_inputs).groupby('method', sort=False)
-    stages = scores.times.groupby('method', sort=False)
+    scans = scores.scans.assign(n_inputs=n_inputs).groupby('method', sort=False, as_index=False)
     pairs = [(name, scores.methods[0]) for name in scores.methods]
-    table = by_method(scores)[['method', 'iou', 'rmse']].assign(
-        n_pseudo_inputs=scans['n_inputs'].mean(),
-        n_evaluations=scans['n_evaluations'].median(),
-        learning=stages['learning'].median(),
-        seconds=scans['seconds'].median(),
+    table = table[['method', 'iou', 'rmse']].assign(
         interval=_differences(scores, 'rmse', pairs)['interval'],
+        n_pseudo_inputs=scans['n_inputs'].mean()['n_inputs'],
+        median=scans['seconds'].median()['seconds'],
     )
     title = (
-        f'{_counted(scores)}; candidates of a line for each pseudo-input; n_L: pseudo-inputs of a '
-        'segment, mean; medians of evaluations and times [ms]; RMSE of the height under labelled '
-        f'ground, interval of it minus that of the first row; {interval_note(scores)}'
+        f'{_counted(scores)}; candidates of a line for each pseudo-input; interval of the RMSE '
+        f'minus that of the first row; n_L: pseudo-inputs of a segment, mean; time of a frame; '
+        f'{interval_note(scores)}'
     )
-    forms = {
-        **_FORMS, 'method': Form('candidates'), 'n_pseudo_inputs': Form('n_L', '.1f'),
-        'n_evaluations': Form('evaluations', '.0f'), 'learning': Form('learning', '.1f', 1e3),
-        'seconds': Form('frame', '.1f', 1e3),
-    }  # fmt: skip
+    forms = {'method': Form('candidates'), 'n_pseudo_inputs': Form('n_L', '.1f')}
     return make_report({'pseudo_inputs': Table(title, table, forms)}, scores, config)
 
 
@@ -239,19 +231,6 @@ def measure_speed(
     frame by frame, so it holds although the speed of the machine drifts. Run nothing else
     meanwhile.
     """
-    scores = time_methods(items, config, runner, with_peer=with_peer)
-    return make_report(speed_tables(scores), scores, config)
-
-
-def time_methods(
-    items: Sequence[Frame],
-    config: Config,
-    runner: Runner = HERE,
-    *,
-    with_peer: bool,
-    clock: Callable[[], float] = time.perf_counter,
-) -> Scores:
-    """Run every method `N_PASSES` times on every frame, one after the other."""
     numpy = {'runtime.backend': 'numpy'}
     variants: dict[str, Changes] = {title: {'learning.mode': m} for m, title in MODES.items()}
     if make_backend(config.runtime).name != 'numpy':
@@ -259,42 +238,17 @@ def time_methods(
     methods: list[Method] = [OurMethod(config.replace(**v), name) for name, v in variants.items()]
     if with_peer:
         methods.insert(len(MODES), PatchworkppMethod.of_sensor(config.sensor))
-    return score_methods([*items] * N_PASSES, methods, _points_of, clock=clock, runner=runner)
+    scores = score_methods([*items] * N_PASSES, methods, _points_of, runner=runner)
+    points = scores.scans['points']
+    title = (
+        f'Time per frame: {len(items)} frames, {N_PASSES} passes, reading left out; '
+        f'{in_thousands(points.median())} points (median), at most {in_thousands(points.max())}'
+    )
+    tables = time_tables(scores, PATCHWORKPP if with_peer else '', title)
+    return make_report(tables, scores, config)
 
 
 def _points_of(frame: Frame) -> KnownScan:
     """Read the points alone: what is not scored leaves the caches as they are."""
     points = read_points(frame.points_path, frame.columns)
     return KnownScan(frame.sequence, frame.index, points)
-
-
-def speed_tables(scores: Scores) -> dict[str, Table]:
-    """Lay out medians and quantiles, their ratios to Patchwork++ frame by frame, and stages."""
-    runs = scores.scans.assign(run=scores.scans.groupby('method').cumcount())
-    seconds = runs.pivot(index='run', columns='method', values='seconds')[scores.methods]
-    median, p99 = seconds.median(), seconds.quantile(0.99)
-    table = median.to_frame('median').assign(p99=p99)
-    if PATCHWORKPP in seconds:
-        table['ratio'] = seconds.div(seconds[PATCHWORKPP], axis='index').median()
-        table['p99_ratio'] = p99 / median[PATCHWORKPP]
-    stages = scores.times.drop(columns=['sequence', 'index']).set_index('method')
-    # Rows of both frames are in the same order.
-    whole = scores.scans.loc[scores.scans['method'] != PATCHWORKPP, 'seconds']
-    stages['rest'] = whole.to_numpy() - stages.sum(axis='columns').to_numpy()
-    medians = stages.groupby('method', sort=False).median()
-    peer, n_frames = title_of(PATCHWORKPP), len(seconds) // N_PASSES
-    points = scores.scans['points']
-    times = {
-        'median': Form('median [ms]', '.2f', 1e3), 'p99': Form('p99 [ms]', '.2f', 1e3),
-        'ratio': Form(f'/ {peer}', '.2f'), 'p99_ratio': Form(f'p99 / {peer} median', '.2f'),
-    }  # fmt: skip
-    title = (
-        f'Time per frame: {n_frames} frames, {N_PASSES} passes, reading left out; '
-        f'{in_thousands(points.median())} points (median), at most {in_thousands(points.max())}'
-    )
-    forms = {str(name): Form(str(name), '.2f', 1e3) for name in medians}
-    forms['method'] = Form('stage, median [ms]')
-    return {
-        'times': Table(title, table.rename(index=title_of).reset_index(), times),
-        'stages': Table('Stages of a frame', medians.reset_index(), forms),
-    }

@@ -4,48 +4,30 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from functools import partial
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.lab.cluster import HERE, Progress, Runner
+from gp_ground_seg.lab.cluster import HERE, Runner
 from gp_ground_seg.lab.scoring.evaluate import (
     ALL,
     KnownScan,
     Method,
     OurMethod,
-    Rows,
     Scores,
     load_kitti,
-    make_scores,
-    score_rows,
+    score_methods,
     sums,
-    title_of,
 )
 from gp_ground_seg.lab.scoring.metrics import ratio
-from gp_ground_seg.lab.scoring.objects import (
-    CLASSES,
-    LOW_CLASSES,
-    LOW_HEIGHTS,
-    Objects,
-)
+from gp_ground_seg.lab.scoring.objects import CLASSES, LOW_CLASSES, LOW_HEIGHTS, Objects
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
-from gp_ground_seg.lab.scoring.report import Form, Report, Table
-from gp_ground_seg.lab.scoring.tables import (
-    COUNT,
-    FORMS,
-    IOU,
-    beside,
-    interval_text,
-    make_report,
-    measured,
-    peer_note,
-)
+from gp_ground_seg.lab.scoring.report import COUNT, Form, Report, Table
+from gp_ground_seg.lab.scoring.tables import beside, make_report, measured, peer_note
 from gp_ground_seg.lab.simulation import (
     LOW,
     PLACES,
@@ -66,8 +48,8 @@ CROWDED = (*(name for name in PLACES if name not in (*LOW, *STEEP)), 'urban')
 """Scenes where objects hide the ground."""
 ROUGH = ('rough', 'road_then_rubble', 'ramp', 'ditch', 'crest', 'blind_slope', *STEEP)
 """Scenes of rough and of steep ground."""
-COUNTED = {'vehicle': 'vehicles', 'person': 'persons', 'cyclist': 'persons'}
-"""Columns of the objects lost, by classes of `scoring.objects.CLASSES`."""
+COUNTED = {'vehicles': ('vehicle',), 'persons': ('person', 'cyclist')}
+"""Columns of objects, and their classes of `scoring.objects.CLASSES`."""
 OBJECT_KINDS = {'vehicle': Kind.BOX, 'person': Kind.PERSON, 'cyclist': Kind.CYCLIST}
 """Kinds of objects that rays hit, by `CLASSES`; crates are boxes too, but no objects."""
 LOWEST_OBJECT = 0.7
@@ -147,14 +129,10 @@ def score_scenes(
     parameters and the true height and place of the sensor. All sensors have one set of
     parameters. Low things, and rough and steep ground, have tables of their own.
     """
-    scores, refused = score_simulated(frames, config, runner, with_peer=with_peer)
+    scores = score_simulated(frames, config, runner, with_peer=with_peer)
     scene_of = {name: name.split()[1] for name in scores.sequences}
-    tables = {'scenes': _scene_table(scores, refused)}
-    for name, make, scenes in (
-        ('objects', _lost_table, {*SCENES} - {*LOW}),
-        ('low', _low_table, {*LOW}),
-        ('rough', _rough_table, {*ROUGH}),
-    ):
+    tables = {'scenes': _scene_table(scores)}
+    for name, make, scenes in (('low', _low_table, LOW), ('rough', _rough_table, ROUGH)):
         if sequences := [one for one, scene in scene_of.items() if scene in scenes]:
             tables[name] = make(scores.of(sequences))
     return make_report(tables, scores, config)
@@ -162,37 +140,18 @@ def score_scenes(
 
 def score_simulated(
     frames: Sequence[SimulatedFrame], config: Config, runner: Runner = HERE, *, with_peer: bool
-) -> tuple[Scores, list[str]]:
-    """Segment simulated scans, all sensors with the parameters `config`.
+) -> Scores:
+    """Segment simulated scans, grouped by sensor, all with the parameters `config`.
 
-    `with_peer` runs Patchwork++ on the same clouds, as `peer_of` makes it. A sensor and scene of
-    which a scan is refused is left out, and the second value says so.
+    `with_peer` runs Patchwork++ on the same clouds, as `peer_of` makes it.
     """
-    groups = [list(group) for _, group in itertools.groupby(frames, lambda f: f.sequence)]
-    parts = runner.run(partial(_score_groups, config, with_peer), groups)
-    outcomes = [*itertools.chain(*parts)]
-    refused = [found for found in outcomes if isinstance(found, str)]
-    if len(refused) == len(outcomes):
-        raise PointCloudError('; '.join(refused))
-    return make_scores(found for found in outcomes if not isinstance(found, str)), refused
-
-
-def _score_groups(
-    config: Config,
-    with_peer: bool,
-    groups: Sequence[Sequence[SimulatedFrame]],
-    progress: Progress,
-) -> list[Rows | str]:
-    """Rows of each group of scans, of one sensor in one scene, or why one is refused."""
-    outcomes: list[Rows | str] = []
-    for frames in progress(groups):
-        methods: list[Method] = [OurMethod(config)]
-        methods += [peer_of(frames[0].sensor)] * with_peer
-        try:
-            outcomes.append(score_rows(load_simulated, methods, frames, each_alone=True))
-        except PointCloudError as error:
-            outcomes.append(f'refused: {error}')
-    return outcomes
+    parts = []
+    for sensor, group in itertools.groupby(frames, attrgetter('sensor')):
+        methods: list[Method] = [OurMethod(config), *([peer_of(sensor)] if with_peer else [])]
+        parts.append(
+            score_methods([*group], methods, load_simulated, each_alone=True, runner=runner)
+        )
+    return Scores.joined(parts)
 
 
 def _placed(table: DataFrame) -> DataFrame:
@@ -204,39 +163,23 @@ def _placed(table: DataFrame) -> DataFrame:
     return table
 
 
-def _scene_table(scores: Scores, refused: Sequence[str]) -> Table:
-    """One row for each sensor and scene; notes say what is left out."""
-    compared = 'iou', 'rmse', 'median_absolute'
-    found = measured(scores.scans, 'sequence')[[*compared, 'without_model']]
-    table = beside(found, scores.methods, *compared)
-    title = (
-        'Simulated scans: IoU against exact labels [%], every point counts; height of the '
-        'surface under true ground [cm]; gaps: share of it without a model [%]'
-    )
-    for peer in scores.methods[1:]:
-        table['interval'] = [interval_text(scores.of([one]), peer, IOU) for one in table.index]
-        title += f'; peer: {title_of(peer)}, with the true height; its surface: the nearest patch'
-        title += '; 95 % interval: bootstrap over the scenes of a row, which are few'
-    forms = {**FORMS, 'without_model': FORMS['without_model']._replace(title='gaps')}
-    return Table(title, _placed(table), forms, refused)
-
-
-def _lost_table(scores: Scores) -> Table:
-    """Objects lost; ours, then the peer if there is one."""
-    kinds = scores.objects.assign(kind=scores.objects['class'].map(COUNTED))
-    counts = sums(kinds.dropna(subset='kind'), 'sequence', 'kind')
-    found = measured(scores.scans, 'sequence')[['iou']]
-    forms = dict(FORMS)
-    for kind in dict.fromkeys(COUNTED.values()):
-        own = counts[counts.index.get_level_values('kind') == kind].droplevel('kind')
+def _scene_table(scores: Scores) -> Table:
+    """One row for each sensor and scene: ground, height, objects lost."""
+    found = measured(scores.scans, 'sequence')[['iou', 'rmse']]
+    forms = dict[str, Form]()
+    for kind, classes in COUNTED.items():
+        own = sums(scores.objects[scores.objects['class'].isin(classes)], 'sequence')
         own = own.reindex(found.index, fill_value=0)
         found = found.assign(**{kind: own['n_objects'], f'lost_{kind}': own['n_lost']})
         forms |= {kind: Form(kind, *COUNT), f'lost_{kind}': Form('lost', *COUNT)}
     lost = [name for name in found if name.startswith('lost_')]
-    table = beside(found, scores.methods, 'iou', *lost).drop(columns='difference', errors='ignore')
-    title = 'IoU of the ground against exact labels [%]; vehicles, persons, cyclists; those lost'
+    table = beside(found, scores, 'iou', 'rmse', *lost)
+    title = (
+        'IoU of the ground against exact labels [%]; RMSE of the surface [cm]; vehicles, persons '
+        'and cyclists, and those lost'
+    )
     title += peer_note(scores, ', which gets the true height and place of the sensor')
-    return Table(title, _placed(table), forms)
+    return Table(title, _placed(table.drop(columns='difference', errors='ignore')), forms)
 
 
 def _low_table(scores: Scores) -> Table:
@@ -246,7 +189,7 @@ def _low_table(scores: Scores) -> Table:
     shares = ratio(by_class['n_lost'], by_class['n_objects']).unstack('class')
     things = sums(low, 'sequence')['n_objects'].to_frame('things')
     found = things.join(shares.reindex(columns=[*LOW_CLASSES]))
-    table = beside(found, scores.methods, *LOW_CLASSES)
+    table = beside(found, scores, *LOW_CLASSES)
     title = 'Low things by height, in plain view 3 to 20 m away, and the share that is lost [%]'
     forms = {name: Form(name.removeprefix('low, '), '.0f', 100.0) for name in LOW_CLASSES}
     forms['things'] = Form('things', *COUNT)
@@ -259,7 +202,7 @@ def _rough_table(scores: Scores) -> Table:
     found['scene'] = found['sequence'].str.split().str[1]
     how = {'n_scans': 'sum', 'n_objects': 'sum', 'iou': 'mean', 'rmse': 'mean', 'n_lost': 'sum'}
     found = found.groupby(['method', 'scene'], sort=False).agg(how)
-    table = beside(found, scores.methods, 'iou', 'rmse', 'n_lost')
+    table = beside(found, scores, 'iou', 'rmse', 'n_lost')
     means = table.mean()
     means.update(table.filter(like='n_').sum())
     table.loc[ALL] = means
@@ -268,4 +211,4 @@ def _rough_table(scores: Scores) -> Table:
         'the surface [cm]; vehicles, persons and crates, and those lost'
     )
     title += peer_note(scores, ', which gets the true height')
-    return Table(title, table.reset_index(), FORMS)
+    return Table(title, table.reset_index())

@@ -19,7 +19,7 @@ from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.lab.cluster import HERE, Runner
 from gp_ground_seg.lab.scoring.evaluate import OurMethod, load_kitti, score_methods
 from gp_ground_seg.lab.scoring.metrics import HEIGHT_MEASURES, height_sums
-from gp_ground_seg.lab.scoring.report import Form, Report, Table, changed_parameters, frame_of
+from gp_ground_seg.lab.scoring.report import Form, Report, Table, frame_of
 
 MODELS = {'Z-L': 'latent', 'Z': 'line_gradient'}
 """The paper's method and the one it is compared with, as values of ``length_scale.model``."""
@@ -44,6 +44,13 @@ PRINTED = {
 VALUES = 'n_PG', 'n_L', *VARIANCES
 ERRORS = 'in sample Z-L', 'in sample Z', 't Z-L [s]', 't Z [s]'
 """Columns of `PRINTED`."""
+HELD_OUT = 'held out n', 'held out Z-L', 'held out Z'
+FORMS = {
+    **dict.fromkeys((*VARIANCES, *ERRORS[:2], *HELD_OUT[1:]), '#.4g'),
+    **dict.fromkeys(('n_PG', 'n_L', 'held out n'), '.0f'),
+    **dict.fromkeys(ERRORS[2:], '.4f'),
+}
+"""Formats of the columns."""
 
 
 def table1(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Report:
@@ -71,26 +78,21 @@ def table1(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Rep
     )
     every = frame_of([*rows, *printed])
     variances = (
-        'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar without unit]; preset: '
+        'Variances learned over the frame by Z-L [m^2; of f_bar and n_bar without unit]; preset: '
         'the preset paper; paper: as printed, of its segments a to d'
     )
     errors = (
         'SMSE in sample (at the inliers) and held out (n points of labelled ground); seconds per '
         f'frame: median of {N_REPEATS} runs on the whole frame, reading left out'
     )
-    forms = {name: Form(name, '.0f' if name in ('n_PG', 'n_L') else '#.4g') for name in rows[0]}
-    forms |= {name: Form(name, '.4f') for name in forms if name.startswith('t ')}
-    forms |= {name: Form(name) for name in ('segment', 'by')}
+    forms = {name: Form(name, form) for name, form in FORMS.items()}
     forms['held out n'] = Form('n', '.0f')
-    held_out = 'held out n', 'held out Z-L', 'held out Z'
+    columns = ['segment', 'by', *ERRORS[:2], *HELD_OUT, *ERRORS[2:]]
     tables = {
         'variances': Table(variances, every[['segment', 'by', *VALUES]], forms),
-        'errors': Table(
-            errors, every[['segment', 'by', *ERRORS[:2], *held_out, *ERRORS[2:]]], forms
-        ),
+        'errors': Table(errors, every[columns], forms),
     }
-    facts = {'config_changes': changed_parameters(config), 'config': config.nested()}
-    return Report(tables, rows, methods[0].last.fit.backend, facts)
+    return Report(tables, rows, methods[0].last.fit.backend, config)
 
 
 def _rows(
@@ -101,9 +103,8 @@ def _rows(
     z = scan.points[:, 2].astype(np.float64)
     scores = score_methods([scan] * N_REPEATS, methods, lambda scan: scan, runner=runner)
     seconds = scores.scans.groupby('method', sort=False)['seconds'].median()
-    results = {method.name: method.last for method in methods}
     # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
-    common = results['Z-L']
+    common = methods[0].last
     candidates = common.candidates
     # A candidate is the point at the same place.
     x, y, _ = common.pose.level(scan.points[:, :3]).T
@@ -113,36 +114,30 @@ def _rows(
         part = slice(*candidates.offsets[segment : segment + 2])
         held_out = modelled & (common.grid.segment == segment)
         held_out &= ~np.isin(x + 1j * y, candidates.x[part] + 1j * candidates.y[part])
-        variances = np.exp(2.0 * common.theta[: len(VARIANCES)])
-        in_sample = {name: _in_sample(result, segment) for name, result in results.items()}
-        rows.append(
-            {
-                'segment': f'{frame.sequence}/{frame.index}:{segment}',
-                'n_PG': int(part.stop - part.start),
-                'n_L': int(np.diff(common.pseudo.offsets)[segment]),
-                **dict(zip(VARIANCES, variances.tolist(), strict=True)),
-                **{f'inliers {name}': n for name, (n, _) in in_sample.items()},
-                **{f'in sample {name}': smse for name, (_, smse) in in_sample.items()},
-                'held out n': int(held_out.sum()),
-                **{
-                    # Of the process itself, as in the paper; not the corrected surface.
-                    f'held out {name}': _smse(
-                        z[held_out], z[held_out] - result.labelled.height[held_out]
-                    )
-                    for name, result in results.items()
-                },
-                **{f't {name} [s]': own for name, own in seconds.items()},
-            }
-        )
+        row: dict[str, Any] = {
+            'segment': f'{frame.sequence}/{frame.index}:{segment}',
+            'n_PG': int(part.stop - part.start),
+            'n_L': int(np.diff(common.pseudo.offsets)[segment]),
+            **dict(zip(VARIANCES, np.exp(2.0 * common.theta).tolist(), strict=False)),
+            'held out n': int(held_out.sum()),
+        }
+        for method in methods:
+            name, result = method.name, method.last
+            # Of the process itself, as in the paper; not the corrected surface.
+            estimate = z[held_out] - result.labelled.height[held_out]
+            row[f'in sample {name}'] = _in_sample(result, segment)
+            row[f'held out {name}'] = _smse(z[held_out], estimate)
+            row[f't {name} [s]'] = seconds[name]
+        rows.append(row)
     return rows
 
 
-def _in_sample(result: Segmentation, segment: int) -> tuple[int, float]:
-    """Inliers of a segment, and the standardised mean squared error of the surface there."""
+def _in_sample(result: Segmentation, segment: int) -> float:
+    """Standardised mean squared error of the surface at the inliers of a segment."""
     candidates, surface = result.candidates, result.surface
     inlier = surface.inlier & (candidates.segment == segment)
     estimate = np.interp(candidates.r[inlier], surface.knots, surface.mean[segment])
-    return int(inlier.sum()), _smse(candidates.z[inlier], estimate)
+    return _smse(candidates.z[inlier], estimate)
 
 
 def _smse(truth: FloatArray, estimate: FloatArray) -> float:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from gp_ground_seg.core.errors import ConfigError, GroundSegError, reason_of, shown
+from gp_ground_seg.core.errors import ConfigError, GroundSegError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import ROS_PARAMETERS_KEY, read_yaml
 
@@ -68,9 +68,7 @@ def _check_surroundings(words: Sequence[str]) -> None:
     for path in _parameter_files(words):
         try:
             document = read_yaml(path)
-        except OSError as error:
-            raise ConfigError(f'{path}: {reason_of(error)}') from error
-        except (UnicodeDecodeError, ConfigError) as error:
+        except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error
         if document and not _node_keys(document):
             raise ConfigError(
@@ -96,7 +94,7 @@ def unused_files(words: Sequence[str], node_name: str) -> list[str]:
     lines = []
     for path in _parameter_files(words):
         keys: list[str] = []
-        with contextlib.suppress(OSError, ConfigError):  # it was read before, and may be gone
+        with contextlib.suppress(ConfigError):  # it was read before, and may be gone
             keys = _node_keys(read_yaml(path))
         if keys and not any(_is_of_node(key, node_name) for key in keys):
             lines.append(

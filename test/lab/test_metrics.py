@@ -1,4 +1,4 @@
-"""True labels, counts, ratios, rings, probabilities, height errors: by loops and by hand."""
+"""True labels, counts, ratios, rings, height errors: by loops and by hand."""
 
 import itertools
 import math
@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import Label
-from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.lab.scoring import metrics
 from gp_ground_seg.lab.scoring.metrics import COUNTS, HEIGHT_MEASURES, label_ratios
 
@@ -60,7 +59,7 @@ def test_rings_against_a_loop(seed, n):
     edges = rng.choice([0.0, 10.0, -50.0, 3e3, np.nan, np.inf], (n, 2))
     xy = np.where(rng.random((n, 2)) < 0.5, rng.uniform(-60.0, 60.0, (n, 2)), edges)
     xy = xy.astype(np.float32)
-    *rings, outside = metrics.count_rings(label, truth, xy)
+    rings = metrics.count_rings(label, truth, xy)
     assert [ring.pop('range') for ring in rings] == [*metrics.RING_TITLES]
     assert len(rings) == len(metrics.RING_EDGES) - 1
     reach = [math.hypot(*map(float, p)) for p in xy]
@@ -68,55 +67,7 @@ def test_rings_against_a_loop(seed, n):
         low, high = metrics.RING_EDGES[k : k + 2]
         inside = np.array([low <= r < high for r in reach], bool)
         assert ring == metrics.count_labels(label[inside], truth[inside])
-    nowhere = ~np.isfinite(reach)
-    assert outside == {
-        'range': metrics.NO_RING, **metrics.count_labels(label[nowhere], truth[nowhere])
-    }  # fmt: skip
     assert (metrics.RING_TITLES[0], metrics.RING_TITLES[-1]) == ('0-10 m', '> 50 m')
-
-
-def draw(seed, n):
-    """Probabilities, many of them at an edge or not known, and true labels."""
-    rng = np.random.default_rng(seed)
-    special = rng.choice([0.0, 1.0, 0.5, 0.001, 0.999, *metrics.BIN_EDGES, math.nan], n)
-    p = np.where(rng.random(n) < 0.5, rng.random(n), special).astype(np.float32)
-    return p, rng.integers(0, 3, n, dtype=np.uint8)
-
-
-def slow(p, truth):
-    """ECE, point by point."""
-    bins = {k: [] for k in range(metrics.N_BINS)}
-    for one, true_label in zip(p.astype(float), truth, strict=True):
-        if true_label != Label.UNKNOWN and not math.isnan(one):
-            k = max(k for k in range(metrics.N_BINS) if metrics.BIN_EDGES[k] <= one)
-            bins[k].append((one, true_label == Label.GROUND))
-    gaps = [abs(sum(y for _, y in pairs) - sum(q for q, _ in pairs)) for pairs in bins.values()]
-    n = sum(map(len, bins.values()))
-    return sum(gaps) / n if n else math.nan
-
-
-@given(SEEDS, st.integers(0, 40), st.integers(0, 40))
-def test_probabilities_against_a_loop_and_those_of_frames_add_up(seed, n, m):
-    (p, truth), (q, other) = draw(seed, n), draw(seed + 1, m)
-    found = bins(p, truth) + bins(q, other)
-    p, truth = np.concatenate([p, q]), np.concatenate([truth, other])
-    expected = slow(p, truth)
-    assert metrics.calibration_error(found) == pytest.approx(expected, nan_ok=True, abs=1e-12)
-    assert found['n'].sum() == ((truth != Label.UNKNOWN) & ~np.isnan(p)).sum()
-    both, whole = bins(p, truth), ['n', 'n_ground']
-    np.testing.assert_array_equal(found[whole], both[whole])
-
-
-def bins(p, truth):
-    rows = metrics.count_bins(p, truth)
-    assert [row['bin'] for row in rows] == [*range(metrics.N_BINS)]
-    return pd.DataFrame(rows).set_index('bin')
-
-
-@pytest.mark.parametrize('p', [[0.5, 1.01], [-0.01, 0.5], [0.5, np.inf], [0.5]])
-def test_what_is_no_probability_is_refused(p):
-    with pytest.raises(PointCloudError, match='p_ground'):
-        metrics.count_bins(np.array(p), np.array([1, 2], dtype=np.uint8))
 
 
 @pytest.mark.parametrize('n', [0, 2])

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.lab.scoring.metrics import GROUND_CLASSES
 from gp_ground_seg.lab.scoring.objects import (
     BAND_EDGES,
@@ -43,14 +42,12 @@ def test_objects_are_those_of_the_points():
 
 def counted_by_loops(points, label, objects):
     """Count as the module says it does, one return after the other."""
-    share, own, unknown = {}, {}, []
+    share, own = {}, {}
     for k, (x, y, z) in enumerate(points):
         kind, number = objects.class_of[k], objects.object_id[k]
         reach, is_ground = math.hypot(x, y), label[k] == Label.GROUND
         if math.isinf(reach):
             continue
-        if kind >= 0 and math.isnan(objects.ground_z[k]):
-            unknown.append((kind, band_of(reach)))
         if kind < 0 or not z - objects.ground_z[k] >= (0.1 if kind >= 3 else MIN_HEIGHT):
             continue
         share.setdefault((kind, band_of(reach)), []).append(is_ground)
@@ -64,14 +61,11 @@ def counted_by_loops(points, label, objects):
             found.setdefault((kind, band), []).append(is_lost)
     return [
         {'class': name, 'range': title, **dict(zip(OBJECT_COUNTS, (
-            *(
-                number for counted in (share, found)
-                for own in [counted.get((kind, band), [])] for number in (len(own), sum(own))
-            ),
-            unknown.count((kind, band)),
+            number for counted in (share, found)
+            for own in [counted.get((kind, band), [])] for number in (len(own), sum(own))
         ), strict=True))}
         for kind, name in enumerate(CLASSES)
-        if any(k == kind for k, _ in [*share, *unknown])
+        if any(k == kind for k, _ in share)
         for band, title in enumerate(BAND_TITLES)
     ]  # fmt: skip
 
@@ -192,7 +186,7 @@ def test_objects_are_cut_and_what_counts_is_low_and_near():
     # Labels are of what is left: ground is what lies 0.2 m over it, and so two of four are.
     left = points[cut.is_kept]
     label = np.where(left[:, 2] - (-1.73 - 0.1 * left[:, 0]) < 0.3, Label.GROUND, Label.OBSTACLE)
-    assert cut.count(label.astype(np.uint8)) == {'low_things_n': 4, 'low_things_wrong': 2}
+    assert cut.count_ground(label.astype(np.uint8)) == {'low_things_n': 4, 'low_things_wrong': 2}
     few = cut_objects(points[5:10], is_object[5:10], ~is_object[5:10], 0.45)
     assert few.is_kept.all() and not few.is_low.any()
 
@@ -251,12 +245,6 @@ def evaluated(root, folder, *words):
     return json.loads((folder / 'a.json').read_text())
 
 
-def row_of(document):
-    """Row of all vehicles."""
-    (row,) = (row for row in document['objects'] if row['range'] == 'all')
-    return row
-
-
 def test_tables_of_objects_low_things_and_false_cells_are_those_of_the_labels(tmp_path, capsys):
     """Both cars whole, and cut at 1 m; segmented by the library."""
     root = write_cars(tmp_path / 'kitti', '00', '08')
@@ -273,7 +261,7 @@ def test_tables_of_objects_low_things_and_false_cells_are_those_of_the_labels(tm
                 found.update({(band, name): row[name] for name in OBJECT_COUNTS})
         cut = cut_objects(points, is_car, is_ground, 1.0)
         assert 50 < (~cut.is_kept).sum() < 500 and cut.is_low.sum() > 50
-        sums.update(cut.count(segmenter.segment(points[cut.is_kept]).label))
+        sums.update(cut.count_ground(segmenter.segment(points[cut.is_kept]).label))
         sums.update(count_false_cells(points, result.label, result.height, entries & 0xFFFF))
     for row in document['objects']:
         own = {n: found[row['range'], n] for n in OBJECT_COUNTS}
@@ -295,33 +283,16 @@ def test_tables_of_objects_low_things_and_false_cells_are_those_of_the_labels(tm
 
 
 def test_labels_without_objects_instances_or_ground(tmp_path):
-    write_frame(tmp_path / 'a', '00', 0, *street())
-    assert 'objects' not in evaluated(tmp_path / 'a', tmp_path)
     points, entries = street_with_cars(0)
-    write_frame(tmp_path / 'b', '00', 0, points, entries & np.uint32(0xFFFF))
-    row = row_of(evaluated(tmp_path / 'b', tmp_path))
-    assert row['n_returns'] > 300 and row['share_ground'] is not None
+    classes = entries & np.uint32(0xFFFF)
+    groundless = np.where(np.isin(classes, GROUND_CLASSES), 0, entries).astype('<u4')
+    found = {}
+    for name, scan in {
+        'none': street(), 'no number': (points, classes), 'no ground': (points, groundless)
+    }.items():  # fmt: skip
+        write_frame(tmp_path / name, '00', 0, *scan)
+        found[name] = evaluated(tmp_path / name, tmp_path).get('objects')
+    assert found['none'] is found['no ground'] is None
+    row = found['no number'][-1]
+    assert row['range'] == 'all' and row['n_returns'] > 300 and row['share_ground'] is not None
     assert (row['n_objects'], row['n_lost']) == (0, None)
-    entries[np.isin(entries & 0xFFFF, GROUND_CLASSES)] = 0
-    write_frame(tmp_path / 'c', '00', 0, points, entries)
-    row = row_of(evaluated(tmp_path / 'c', tmp_path))
-    assert (row['share_ground'], row['n_unknown']) == (None, 600)
-
-
-def test_objects_of_the_frames_at_hand(kitti):
-    """By hand from the label files: instances of things in the first frame of sequence 00."""
-    path = kitti / 'sequences/00/velodyne/000000.bin'
-    points = read_points(path)
-    entries = np.fromfile(path.parent.parent / 'labels/000000.label', '<u4')
-    is_ground = np.isin(entries & 0xFFFF, GROUND_CLASSES)
-    found = labelled_objects(points, entries, is_ground)
-    on = found.class_of >= 0
-    assert set(np.unique(entries[on] & 0xFFFF)) <= {*range(10, 33), *range(252, 260)}
-    assert np.isfinite(found.ground_z[on]).mean() > 0.98
-    # Wheels stand on it.
-    cars = on & (found.object_id > 0) & (np.hypot(*points[:, :2].T) < 15.0)
-    for number in np.unique(found.object_id[cars]):
-        own = cars & (found.object_id == number)
-        if own.sum() > 500:
-            foot = np.quantile(points[own, 2] - found.ground_z[own], 0.01)
-            assert -0.15 < foot < 0.4

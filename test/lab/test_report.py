@@ -24,7 +24,7 @@ TABLE = Table(
     }),
     {
         'name': Form('sequence'), 'points': Form('points', ',.0f'),
-        'iou': Form('IoU [%]', '.2f', 100.0), 'change': Form('change', '+.1f', [100.0, 1.0, 1.0]),
+        'iou': Form('IoU [%]', '.2f', 100.0), 'change': Form('change', '+.1f', 100.0),
     },
     ['a note'],
 )  # fmt: skip
@@ -32,7 +32,7 @@ CELLS = [
     ['sequence', 'points', 'IoU [%]', 'peer IoU [%]', 'change'],
     ['00', '1 234 567', '98.76', '25.00', '-0.1'],
     ['08', '-', '-', '0.00', '-'],
-    ['all', '1 234 572', '50.00', '-', '+0.2'],
+    ['all', '1 234 572', '50.00', '-', '+25.0'],
 ]
 
 
@@ -41,11 +41,11 @@ def test_forms_of_a_table():
     assert (title, note) == ('Scores', 'a note')
     assert [line.split() for line in lines] == [' '.join(row).split() for row in CELLS]
     assert len({*map(len, lines)}) == 1
-    title, table, note = TABLE.markdown().split('\n\n')
+    title, table, note = TABLE.text(markdown=True).split('\n\n')
     titles, rule, *rows = (line.split('|')[1:-1] for line in table.splitlines())
     assert [[cell.strip() for cell in row] for row in (titles, *rows)] == CELLS
     assert [mark[-1] == ':' for mark in rule] == [False, True, True, True, True]
-    assert TABLE.json() == [
+    assert report.records(TABLE.frame) == [
         {'name': '00', 'points': 1234567, 'iou': 0.9876, 'peer_iou': 0.25, 'change': -0.001},
         {'name': '08', 'points': None, 'iou': None, 'peer_iou': 2e-20, 'change': None},
         {'name': 'all', 'points': 1234572, 'iou': 0.5, 'peer_iou': None, 'change': 0.25},
@@ -56,28 +56,25 @@ def test_long_titles_are_folded_in_the_terminal_only_and_no_rows_have_no_titles(
     table = Table('word ' * 40, report.frame_of([], ['a']), {}, ['nothing'])
     assert max(map(len, table.text().splitlines())) <= report.WIDTH
     assert table.text().splitlines()[-1] == 'nothing' and ' a' not in table.text()
-    assert len(table.markdown().splitlines()[0]) > report.WIDTH
-    assert table.json() == []
+    assert len(table.text(markdown=True).splitlines()[0]) > report.WIDTH
+    assert report.records(table.frame) == []
 
 
 def test_json_files_have_null_for_what_is_undefined(tmp_path):
     rows = pd.DataFrame({'n': np.array([3]), 'x': [math.nan], 'is_so': [np.bool_(True)]})
-    found = Report({'table': TABLE}, report.records(rows), 'numba', {'cut': 0.5})
-    found.write(tmp_path / 'a.json', {'cpu': 'x'})
+    config = Config().replace(**{'label.ground_tolerance': 0.123})
+    found = Report({'table': TABLE}, report.records(rows), 'numba', config)
+    found.write(tmp_path / 'a.json', {'cpu': 'x'}, cut=0.5)
     document = json.loads((tmp_path / 'a.json').read_text())
     assert document == {
-        'cut': 0.5, 'backend': 'numba', 'environment': {'cpu': 'x'}, 'table': TABLE.json(),
-        'rows': [{'n': 3, 'x': None, 'is_so': True}],
+        'cut': 0.5, 'backend': 'numba', 'environment': {'cpu': 'x'},
+        'table': report.records(TABLE.frame), 'rows': [{'n': 3, 'x': None, 'is_so': True}],
+        'config_changes': {'label.ground_tolerance': 0.123}, 'config': config.nested(),
     }  # fmt: skip
     assert isinstance(document['rows'][0]['n'], int)
 
 
-def test_parameters_and_environment_are_recorded():
-    changes = {'label.ground_tolerance': 0.123, 'runtime.backend': 'numpy'}
-    assert report.changed_parameters(Config()) == {}
-    assert report.changed_parameters(Config().replace(**changes)) == changes
-    assert report.parameters_line({}) == 'parameters: defaults'
-    assert 'runtime.backend=numpy' in report.parameters_line(changes)
+def test_the_environment_is_recorded():
     environment = report.describe_environment('no-such-package')
     assert environment['versions']['gp_ground_seg'] == __version__
     assert environment['versions']['no-such-package'] is None

@@ -97,8 +97,8 @@ class SensorPose:
     roll, pitch : float
         Fixed-axis angles that turn the sensor frame level, as those of a URDF [rad]:
         positive roll lifts the left side, positive pitch lowers the nose (REP-103).
-    height_estimated, roll_estimated, pitch_estimated : bool
-        Whether each comes from this scan rather than from the parameters or a default.
+    height_estimated : bool
+        Whether the height comes from this scan rather than from the parameters or a default.
     measured : MeasuredPose or None
         What the scan says; None if it shows no plane at all.
     contradictions : tuple of str
@@ -115,8 +115,6 @@ class SensorPose:
     roll: float
     pitch: float
     height_estimated: bool = False
-    roll_estimated: bool = False
-    pitch_estimated: bool = False
     measured: MeasuredPose | None = None
     contradictions: tuple[str, ...] = ()
     is_height_default: bool = False
@@ -210,8 +208,6 @@ def estimate_pose(
         roll=roll,
         pitch=pitch,
         height_estimated=estimates_height,
-        roll_estimated=sensor.roll == AUTO and corrects,
-        pitch_estimated=sensor.pitch == AUTO and corrects,
         measured=measured,
         contradictions=contradictions
         or _contradictions(candidates, sensor, measured, view, level),

@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 OURS = 'gp_ground_seg'
-PATCHWORKPP = 'patchworkpp'
-TITLES = {PATCHWORKPP: 'Patchwork++'}
-"""Names of methods in tables, where they differ from those in files."""
+PATCHWORKPP = 'Patchwork++'
 FIT = ('mode', 'status', 'n_evaluations', 'n_segments', 'n_pseudo_inputs', 'backend')
 POSE = ('height', 'height_estimated', 'roll', 'pitch')
 """What is reported of the learning and of the sensor in a scan of ours; angles in radians."""
+STAGE = 'stage_'
+"""Beginning of the columns with the seconds of a stage of ours."""
 Points = npt.NDArray[np.floating]
 
 ALL = 'all'
@@ -47,9 +47,7 @@ KEYS = ('method', 'sequence', 'index')
 COLUMNS: dict[str, tuple[str, ...]] = {
     'scans': KEYS,
     'rings': (*KEYS, 'range', *COUNTS),
-    'bins': (*KEYS, 'bin', 'n', 'n_ground', 'p'),
     'objects': (*KEYS, 'class', 'range', *OBJECT_COUNTS),
-    'times': KEYS,
 }
 """Columns that each frame has, even without rows."""
 
@@ -66,7 +64,6 @@ class MethodResult:
 
     label: Labels  # (N,)
     ground_z: FloatArray  # (N,) height of the ground under each point [m]; NaN = no model
-    p_ground: npt.NDArray[np.floating] | None = None  # (N,), where the method has probabilities
 
 
 class Method(Protocol):
@@ -126,11 +123,6 @@ class KnownScan:
     returns scatter by `return_std`, exact heights by `ground_std`."""
     cluster: str = ''  # scans that the bootstrap draws together; by default the sequence
     cut: CutScan | None = None  # what of it is segmented once more, to count low things
-
-
-def title_of(method: str) -> str:
-    """Name of a method in tables."""
-    return TITLES.get(method, method)
 
 
 def load_kitti(frame: Frame, cut: float = 0.0) -> KnownScan:
@@ -232,7 +224,7 @@ def _low_things(scan: KnownScan, method: Method, *, forgets: bool) -> dict[str, 
     if forgets:
         method.reset()
     _run(method, replace(scan, points=scan.points[scan.cut.is_kept]))
-    return scan.cut.count(method.result().label)
+    return scan.cut.count_ground(method.result().label)
 
 
 def _score(scan: KnownScan, result: MethodResult | Segmentation) -> Rows:
@@ -243,8 +235,6 @@ def _score(scan: KnownScan, result: MethodResult | Segmentation) -> Rows:
     if scan.truth is not None:
         sums |= metrics.count_labels(label, scan.truth)
         rows['rings'] = metrics.count_rings(label, scan.truth, scan.points)
-        if result.p_ground is not None:
-            rows['bins'] = metrics.count_bins(result.p_ground, scan.truth)
     if scan.ground_z is not None and scan.is_ground is not None:
         ground, std = scan.is_ground, getattr(result, scan.std, None)
         sums |= metrics.height_sums(
@@ -258,7 +248,8 @@ def _score(scan: KnownScan, result: MethodResult | Segmentation) -> Rows:
             sums |= objects.count_false_cells(scan.points, label, result.height, scan.semantic)
         sums |= {name: getattr(result.fit, name) for name in FIT}
         sums |= {f'sensor_{name}': getattr(result.pose, name) for name in POSE}
-        rows['times'] = [{k: s for k, s in result.timings.items() if k != 'total'}]
+        stages = {name: s for name, s in result.timings.items() if name != 'total'}
+        sums |= {f'{STAGE}{name}': seconds for name, seconds in stages.items()}
     return {'scans': [sums], **rows}
 
 
@@ -268,23 +259,24 @@ class Scores(NamedTuple):
     Attributes
     ----------
     scans : sums of each scan: `COUNTS`, of `metrics.height_sums`, `OBJECT_COUNTS`, shares;
-        seconds, pose, fit; a column that a method does not have is NaN in its rows
+        seconds, those of the stages, pose, fit; what a method does not have is NaN
     rings : `COUNTS` of each ring of a scan
-    bins : `metrics.count_bins` of each scan
     objects : `OBJECT_COUNTS` of each scan, by class and band
-    times : seconds of each stage, of methods that report them
     """
 
     scans: DataFrame
     rings: DataFrame
-    bins: DataFrame
     objects: DataFrame
-    times: DataFrame
 
     @property
     def methods(self) -> list[str]:
         """Names of the methods, in order."""
         return list(self.scans['method'].unique())
+
+    @property
+    def peer(self) -> str:
+        """Name of the method that the first one is compared with, if there is one."""
+        return ''.join(self.methods[1:2])
 
     @property
     def sequences(self) -> list[str]:
@@ -300,6 +292,12 @@ class Scores(NamedTuple):
         """Return the part of some sequences."""
         names = [*sequences]
         return Scores(*(frame[frame['sequence'].isin(names)] for frame in self))
+
+    @classmethod
+    def joined(cls, parts: Iterable[Scores]) -> Scores:
+        """Join the scores of the same methods on several groups of scans."""
+        concat = require_pandas().concat
+        return cls(*(concat(frames, ignore_index=True) for frames in zip(*parts, strict=True)))
 
 
 def make_scores(parts: Iterable[Rows]) -> Scores:

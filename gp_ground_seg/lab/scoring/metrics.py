@@ -1,4 +1,4 @@
-"""Labels, probabilities and heights of a scan against the truth, as sums; ratios of sums.
+"""Labels and heights of a scan against the truth, as sums; ratios of sums.
 
 Sums add up over scans. A measure is a function of sums by name: of a mapping of numbers, or of a
 frame of pandas, whose rows are scans or groups of them. Ratios over nothing are NaN.
@@ -35,12 +35,6 @@ def range_titles(edges: Sequence[float]) -> tuple[str, ...]:
 RING_EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, math.inf)
 """Edges of the rings of horizontal range [m]; each holds its inner edge, not its outer one."""
 RING_TITLES = range_titles(RING_EDGES)
-NO_RING = 'no range'
-"""Where points without a finite range are counted."""
-
-BIN_EDGES = np.linspace(0.0, 1.0, 16)
-"""Edges of the bins of probability in the expected calibration error."""
-N_BINS = len(BIN_EDGES) - 1
 
 
 def true_labels(semantic: npt.NDArray[np.integer]) -> Labels:
@@ -111,17 +105,14 @@ def count_labels(label: Labels, truth: Labels) -> dict[str, int]:
 def count_rings(
     label: Labels, truth: Labels, points: npt.NDArray[np.floating]
 ) -> list[dict[str, Any]]:
-    """Compare by horizontal range of `points` (N, >=2) [m], one row for each ring.
-
-    The last one, `NO_RING`, has the points without a finite range.
-    """
+    """Compare by horizontal range of `points` (N, >=2) [m], one row for each ring."""
     x, y = points[:, :2].astype(np.float64).T
     reach = np.hypot(x, y)
-    ring = np.where(np.isfinite(reach), np.digitize(reach, RING_EDGES[1:-1]), len(RING_TITLES))
-    counts = _counts(label, truth, ring, len(RING_TITLES) + 1).tolist()
+    ring = np.digitize(reach, RING_EDGES[1:])  # without a finite range: one more
+    counts = _counts(label, truth, ring, len(RING_EDGES)).tolist()
     return [
         {'range': title, **dict(zip(COUNTS, own, strict=True))}
-        for title, own in zip([*RING_TITLES, NO_RING], counts, strict=True)
+        for title, own in zip(RING_TITLES, counts, strict=False)
     ]
 
 
@@ -140,38 +131,6 @@ def check_lengths(n_points: int, **values: Any) -> None:
             raise PointCloudError(
                 f'{name} of shape {array.shape} for {n_points} points: must be ({n_points},)'
             )
-
-
-def count_bins(p_ground: npt.NDArray[np.floating], truth: Labels) -> list[dict[str, Any]]:
-    """Compare probabilities of ground, (N,), with true labels, (N,), one row for each bin.
-
-    A bin holds its lower edge, the last one 1 as well. Points whose probability is NaN or whose
-    truth is UNKNOWN do not count. `p` is the sum of the probabilities.
-    """
-    check_lengths(len(truth), p_ground=p_ground)
-    known = ~np.isnan(p_ground)
-    if not ((p_ground[known] >= 0.0) & (p_ground[known] <= 1.0)).all():
-        raise PointCloudError('p_ground: a probability is outside [0, 1]')
-    known &= (truth == Label.GROUND) | (truth == Label.OBSTACLE)
-    ground, p = truth[known] == Label.GROUND, p_ground[known].astype(np.float64)
-    bin_of = np.searchsorted(BIN_EDGES[1:-1], p, side='right')
-    sums = (
-        np.bincount(bin_of, minlength=N_BINS),
-        np.bincount(bin_of[ground], minlength=N_BINS),
-        np.bincount(bin_of, p, minlength=N_BINS).astype(np.float64),
-    )
-    columns = zip(*(values.tolist() for values in sums), strict=True)
-    return [{'bin': k, 'n': n, 'n_ground': m, 'p': q} for k, (n, m, q) in enumerate(columns)]
-
-
-def calibration_error(sums: Any) -> float:
-    """Return the expected calibration error of a frame with a row for each bin.
-
-    It is the mean over the points of their bin's |share of ground - mean p|:
-    Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, for the probability of one
-    class of two.
-    """
-    return float(ratio((sums['n_ground'] - sums['p']).abs().sum(), sums['n'].sum()))
 
 
 def height_sums(

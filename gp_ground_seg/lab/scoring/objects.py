@@ -10,8 +10,7 @@ part is cut off, and **false cells**, ground that a costmap takes for an obstacl
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -47,11 +46,10 @@ CLASSES: dict[str, tuple[int, ...]] = {
 LOW_MIN_HEIGHT, LOW_MIN_RETURNS = 0.1, 3
 """`MIN_HEIGHT` [m] and `MIN_RETURNS` of `LOW_CLASSES`."""
 
-LOW_THINGS = 'low_things'
 CELLS = {'road_cells': (40, 44), 'ground_cells': (40, 44, 48, 49, 60)}
 """Classes of SemanticKITTI whose cells are counted."""
 SHARES = {
-    LOW_THINGS: 'returns on low things called ground',
+    'low_things': 'returns on low things called ground',
     'road_cells': 'cells of road called obstacle',
     'ground_cells': 'cells of ground called obstacle',
 }
@@ -66,26 +64,17 @@ FALSE_SIZE, FALSE_RANGE, FALSE_OVER = 0.1, 20.0, 0.15
 [m] from which on an obstacle in them makes them false."""
 
 
-@dataclass(frozen=True)
-class Objects:
-    """Which of the N returns of a scan lie on objects.
+class Objects(NamedTuple):
+    """Which of the N returns of a scan lie on objects."""
 
-    Attributes
-    ----------
-    class_of : (N,) index into `CLASSES`; negative: on no object
-    object_id : (N,) number of the object within its class; 0 = not known
-    ground_z : (N,) height of the local ground [m]; NaN = not known, the return does not count
-    """
-
-    class_of: npt.NDArray[np.integer]
-    object_id: npt.NDArray[np.integer]
-    ground_z: npt.NDArray[np.floating]
+    class_of: npt.NDArray[np.integer]  # (N,) index into `CLASSES`; negative: on no object
+    object_id: npt.NDArray[np.integer]  # (N,) number of it within its class; 0 = not known
+    ground_z: npt.NDArray[np.floating]  # (N,) local ground [m]; NaN = not known: does not count
 
 
-OBJECT_COUNTS = ('n_returns', 'n_ground', 'n_objects', 'n_lost', 'n_unknown')
+OBJECT_COUNTS = ('n_returns', 'n_ground', 'n_objects', 'n_lost')
 """Returns from `MIN_HEIGHT` above the ground, and those called ground; objects with at least
-`MIN_RETURNS` of them, and those with more than half of them called ground; returns at any height
-that do not count, as their ground is not known."""
+`MIN_RETURNS` of them, and those with more than half of them called ground."""
 
 
 def count_objects(
@@ -95,15 +84,14 @@ def count_objects(
 
     `points` (N, >=3) are x, y, z [m], `label` (N,) what a method says of them; UNKNOWN is not
     ground. A return counts in the band of its horizontal range, an object in that of the
-    median of its returns that count. Classes without a return that counts, or would, are left out.
+    median of its returns that count. Classes without a return that counts are left out.
     """
-    check_lengths(len(points), **vars(objects))
+    check_lengths(len(points), **objects._asdict())
     x, y, z = points[:, :3].astype(np.float64).T
     reach = np.hypot(x, y)
     on = (objects.class_of >= 0) & np.isfinite(reach + z)
     least = np.where(_is_low(objects.class_of), LOW_MIN_HEIGHT, MIN_HEIGHT)
-    counts, lacks = on & (z - objects.ground_z >= least), on & np.isnan(objects.ground_z)
-    unknown = _by_class_and_band(objects.class_of[lacks], reach[lacks], lacks[lacks])
+    counts = on & (z - objects.ground_z >= least)
     kind, reach, is_ground = objects.class_of[counts], reach[counts], label[counts] == Label.GROUND
     returns = _by_class_and_band(kind, reach, is_ground)
 
@@ -118,7 +106,7 @@ def count_objects(
     enough = n_returns >= np.where(_is_low(of_object[:, 0]), LOW_MIN_RETURNS, MIN_RETURNS)
     lost = 2 * n_ground[enough] > n_returns[enough]
     found = _by_class_and_band(of_object[enough, 0], middle[enough], lost)
-    bands = np.concatenate([returns, found, unknown[:, :, :1]], axis=2)
+    bands = np.concatenate([returns, found], axis=2)
     return [
         {'class': name, 'range': band, **dict(zip(OBJECT_COUNTS, numbers, strict=True))}
         for name, found in zip(CLASSES, bands.tolist(), strict=True)
@@ -189,24 +177,17 @@ def labelled_objects(
     return Objects(class_of, object_id, local_ground(points, is_ground, class_of >= 0))
 
 
-@dataclass(frozen=True)
-class CutScan:
-    """A scan of N points without what is high of its objects.
+class CutScan(NamedTuple):
+    """A scan of N points without what is high of its objects."""
 
-    Attributes
-    ----------
-    is_kept : (N,) whether a return is left
-    is_low : (N,) whether it counts as one on a low thing
-    """
+    is_kept: BoolArray  # (N,) whether a return is left
+    is_low: BoolArray  # (N,) whether it counts as one on a low thing
 
-    is_kept: BoolArray
-    is_low: BoolArray
-
-    def count(self, label: Labels) -> dict[str, int]:
+    def count_ground(self, label: Labels) -> dict[str, int]:
         """Count low returns called ground; `label` is of those left, in their order."""
         is_low = self.is_low[self.is_kept]
         n_wrong = int((label[is_low] == Label.GROUND).sum())
-        return {f'{LOW_THINGS}_n': int(is_low.sum()), f'{LOW_THINGS}_wrong': n_wrong}
+        return {'low_things_n': int(is_low.sum()), 'low_things_wrong': n_wrong}
 
 
 def cut_objects(

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from gp_ground_seg.core.backend import Backend, make_backend
+from gp_ground_seg.core.backend import make_backend
 from gp_ground_seg.core.errors import ConfigError, require
-from gp_ground_seg.core.frame import FloatArray, Frame, GroundSurface, Label
+from gp_ground_seg.core.frame import FloatArray, Frame, Label
 from gp_ground_seg.core.parameters.config import Config, SensorConfig
 from gp_ground_seg.core.parameters.schema import AUTO
 from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, MethodResult, OurMethod, Points
@@ -22,9 +22,8 @@ from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, MethodResult, OurMet
 class PatchworkppMethod:
     """Patchwork++ (Lee, Lim, Myung, IROS 2022) from PyPI, with its published parameters.
 
-    Its thresholds adapt over a sequence. It takes the sensor to be at the origin, that many metres
-    above the ground: `origin` [m] is where the sensor is in the cloud's frame, and the default
-    `sensor_height` [m] that of KITTI.
+    Its thresholds adapt over a sequence. It takes the sensor to be at the origin: `origin` [m] is
+    where the sensor is in the cloud's frame. The default `sensor_height` [m] is that of KITTI.
     """
 
     name = PATCHWORKPP
@@ -113,40 +112,27 @@ of six pairs on a third of the labelled frames."""
 class InterpolationMethod(OurMethod):
     """Our method without a Gaussian process: lowest points joined by straight lines.
 
-    Nothing is learned; all but the heights of the surface is that of the parameters.
+    Nothing is learned. Of each segment `ground_points` are interpolated; the surface is the median
+    of three segments. All else, such as its standard deviation and its end, is that of ours.
     """
 
     def __init__(self, config: Config, name: str = INTERPOLATION) -> None:
-        backend: Any = InterpolatingBackend(make_backend(config.runtime))
+        backend: Any = make_backend(config.runtime)
+        estimate = backend.estimate_surface
+
+        def interpolate(frame: Frame, *others: Any) -> tuple[Any, ...]:
+            surface, *scales = estimate(frame, *others)
+            lines = np.empty_like(surface.mean)
+            for segment, line in enumerate(lines):
+                part = slice(*frame.candidates.offsets[segment : segment + 2])
+                r, z = frame.candidates.r[part], frame.candidates.z[part]
+                line[:] = np.interp(frame.knots, *ground_points(r, z, frame.prior_mean))
+            mean = np.median([np.roll(lines, k, axis=0) for k in (-1, 0, 1)], axis=0)
+            mean[np.isnan(surface.mean)] = np.nan
+            return surface._replace(mean=mean), *scales
+
+        backend.estimate_surface = interpolate
         super().__init__(config.replace(**{'learning.mode': 'fixed'}), name, backend)
-
-
-class InterpolatingBackend:
-    """The stages of another backend, but for the heights of the surface."""
-
-    def __init__(self, backend: Backend) -> None:
-        self._backend = backend
-
-    def __getattr__(self, name: str) -> Any:
-        """Return a stage of the other backend."""
-        return getattr(self._backend, name)
-
-    def estimate_surface(
-        self, frame: Frame, theta: FloatArray, config: Config
-    ) -> tuple[GroundSurface, FloatArray, FloatArray]:
-        """Interpolate `ground_points` of each segment; take the median of three segments.
-
-        Standard deviation and end of the surface are those of the other backend.
-        """
-        surface, *scales = self._backend.estimate_surface(frame, theta, config)
-        lines = np.empty_like(surface.mean)
-        for segment, line in enumerate(lines):
-            part = slice(*frame.candidates.offsets[segment : segment + 2])
-            r, z = frame.candidates.r[part], frame.candidates.z[part]
-            line[:] = np.interp(frame.knots, *ground_points(r, z, frame.prior_mean))
-        mean = np.median([np.roll(lines, k, axis=0) for k in (-1, 0, 1)], axis=0)
-        mean[np.isnan(surface.mean)] = np.nan
-        return surface._replace(mean=mean), scales[0], scales[1]
 
 
 def ground_points(r: FloatArray, z: FloatArray, start: float) -> tuple[list[float], list[float]]:

@@ -1,4 +1,4 @@
-"""Results: frames of pandas as tables and JSON; machine, versions and parameters of a run."""
+"""Results as tables and JSON, and on which machine and with what versions they were made."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import platform
 import subprocess
 import textwrap
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,7 +19,7 @@ from gp_ground_seg.data.files import write_file
 from gp_ground_seg.lab.cluster import package_versions
 
 if TYPE_CHECKING:
-    from pandas import DataFrame, Series
+    from pandas import DataFrame
 
 WIDTH = 100
 """Columns of the terminal that titles and notes are folded to."""
@@ -29,19 +30,56 @@ PEER = 'peer_'
 class Form(NamedTuple):
     """How a column is shown: its title, the format of its numbers, and the factor before it.
 
-    Without a format the column holds text. The factor may be one for each row.
+    Without a format the column holds text.
     """
 
     title: str
     format: str = ''
-    scale: float | Sequence[float] = 1.0
+    scale: float = 1.0
+
+
+SHARE, SIGNED, COUNT = ('.2f', 100.0), ('+.2f', 100.0), (',.0f',)
+"""Formats and factors: of ratios in percent and metres in cm; of their differences; counts."""
+FORMS = {
+    'n_scans': Form('frames', *COUNT),
+    'points': Form('points', *COUNT),
+    'precision': Form('precision', *SHARE),
+    'recall': Form('recall', *SHARE),
+    'f1': Form('F1', *SHARE),
+    'accuracy': Form('accuracy', *SHARE),
+    'iou': Form('IoU', *SHARE),
+    'difference': Form('difference', *SIGNED),
+    'interval': Form('95 % interval'),
+    'errors': Form('errors', *COUNT),
+    'share_of_errors': Form('of errors', *SHARE),
+    'n_returns': Form('returns', *COUNT),
+    'share_ground': Form('as ground', *SHARE),
+    'n_objects': Form('objects', *COUNT),
+    'n_lost': Form('lost', *COUNT),
+    'low_things_n': Form('low returns', *COUNT),
+    'low_things': Form('as ground', *SHARE),
+    'road_cells_n': Form('road cells', *COUNT),
+    'road_cells': Form('false', '.3f', 100.0),
+    'ground_cells_n': Form('ground cells', *COUNT),
+    'ground_cells': Form('false', '.3f', 100.0),
+    'n_points': Form('points', *COUNT),
+    'without_model': Form('no model', *SHARE),
+    'bias': Form('bias', *SHARE),
+    'rmse': Form('RMSE', *SHARE),
+    'median_absolute': Form('median', *SHARE),
+    'within_1': Form('in 1 std', '.1f', 100.0),
+    'within_2': Form('in 2 std', '.1f', 100.0),
+    'median': Form('median [ms]', '.2f', 1e3),
+    'p99': Form('p99 [ms]', '.2f', 1e3),
+}
+"""How columns are shown in all tables, by their name in JSON."""
 
 
 class Table(NamedTuple):
     """A frame of unscaled numbers and text, whose columns have the names that JSON has.
 
-    A column that is not in `forms` is text under its name, and one of the other method has the
-    form of ours.
+    `forms` are those of columns that are not shown as in `FORMS`. A column in neither is text
+    under its name.
     """
 
     title: str
@@ -49,37 +87,31 @@ class Table(NamedTuple):
     forms: Mapping[str, Form] = {}
     notes: Sequence[str] = ()
 
-    def shown(self) -> DataFrame:
-        """Return the cells as text, under their titles; ``-`` is none."""
-        forms = [self._form(name) for name in self.frame]
-        cells = self.frame.reset_index(drop=True).astype(object)
-        for name, form in zip(cells, forms, strict=True):
-            cells[name] = _text(cells[name], form)
-        return cells.set_axis([form.title for form in forms], axis='columns')
-
-    def _form(self, name: str) -> Form:
-        """Return the form of a column, which has that of ours if it has none of its own."""
-        form = self.forms.get(name)
-        if form is None and name.startswith(PEER):
-            ours = self._form(name.removeprefix(PEER))
+    def form(self, name: str) -> Form:
+        """Return the form of a column; one of the other method has that of ours."""
+        found = self.forms.get(name) or FORMS.get(name)
+        if found is None and name.startswith(PEER):
+            ours = self.form(name.removeprefix(PEER))
             return ours._replace(title=f'peer {ours.title}')
-        return form or Form(name)
+        return found or Form(name)
 
-    def text(self) -> str:
-        """Return title, aligned cells and notes for the terminal."""
-        cells = self.shown()
-        table = [cells.to_string(index=False)] if len(cells) else []
-        return '\n'.join([fold(self.title), *table, *map(fold, self.notes)])
-
-    def markdown(self) -> str:
-        """Return a Markdown table, title and notes as paragraphs."""
-        sides = ['right' if self._form(name).format else 'left' for name in self.frame]
-        table = self.shown().to_markdown(index=False, disable_numparse=True, colalign=sides)
-        return '\n\n'.join([self.title, table, *self.notes])
-
-    def json(self) -> list[dict[str, Any]]:
-        """Return one object per row, unscaled."""
-        return records(self.frame)
+    def text(self, *, markdown: bool = False) -> str:
+        """Return title, cells and notes, for the terminal or as Markdown; ``-`` is none."""
+        forms = [self.form(name) for name in self.frame]
+        cells = self.frame.reset_index(drop=True).astype(object)
+        for name, (_, style, scale) in zip(cells, forms, strict=True):
+            cells[name] = [
+                '-' if gone else str(value) if not style
+                else f'{value * scale:{style}}'.replace(',', ' ')
+                for value, gone in zip(cells[name], cells[name].isna(), strict=True)
+            ]  # fmt: skip
+        cells = cells.set_axis([form.title for form in forms], axis='columns')
+        if markdown:
+            sides = ['right' if form.format else 'left' for form in forms]
+            table = cells.to_markdown(index=False, disable_numparse=True, colalign=sides)
+            return '\n\n'.join([self.title, table, *self.notes])
+        rows = [cells.to_string(index=False)] if len(cells) else []
+        return '\n'.join([fold(self.title), *rows, *map(fold, self.notes)])
 
 
 def frame_of(rows: Any, columns: Sequence[str] | None = None) -> DataFrame:
@@ -94,16 +126,6 @@ def require_pandas() -> Any:
     return require('pandas', 'pandas tabulate')
 
 
-def _text(values: Series, form: Form) -> list[str]:
-    """Return the cells of a column as they are shown, thousands set apart by a blank."""
-    if not form.format:
-        shown = [str(value) for value in values]
-    else:
-        scaled = values.astype(float) * form.scale
-        shown = [f'{value:{form.format}}'.replace(',', ' ') for value in scaled]
-    return ['-' if gone else cell for cell, gone in zip(shown, values.isna(), strict=True)]
-
-
 def records(frame: DataFrame) -> list[dict[str, Any]]:
     """Return the rows with values of Python, None for NaN."""
     found: list[dict[str, Any]] = (
@@ -115,6 +137,38 @@ def records(frame: DataFrame) -> list[dict[str, Any]]:
 def fold(line: str) -> str:
     """Fold a line for the terminal."""
     return textwrap.fill(line, WIDTH, subsequent_indent='  ', break_on_hyphens=False)
+
+
+class Report(NamedTuple):
+    """Tables to show, every number by scan or segment, the backend, and the parameters."""
+
+    tables: dict[str, Table]
+    rows: list[dict[str, Any]]
+    backend: str
+    config: Config
+
+    def text(self, machine: str, *, markdown: bool) -> str:
+        """Return the tables, and below them the line on the machine."""
+        tables = [table.text(markdown=markdown) for table in self.tables.values()]
+        return '\n\n'.join([*tables, machine if markdown else fold(machine)])
+
+    def write(self, path: Path, environment: Mapping[str, Any], **facts: Any) -> None:
+        """Write every number as JSON, and further `facts`."""
+        document = {
+            'config_changes': changed_parameters(self.config),
+            'config': self.config.nested(),
+            **facts,
+            'backend': self.backend,
+            'environment': environment,
+            **{name: records(table.frame) for name, table in self.tables.items()},
+            'rows': self.rows,
+        }
+        write_file(path, (json.dumps(document, indent=2, allow_nan=False) + '\n').encode())
+
+
+def changed_parameters(config: Config) -> dict[str, Any]:
+    """Parameters that differ from their defaults, by dotted name."""
+    return {spec.name: value for spec, _, value in Config().differences(config)}
 
 
 def describe_environment(*packages: str) -> dict[str, Any]:
@@ -146,24 +200,12 @@ def machine_line(environment: Mapping[str, Any], backend: str = '') -> str:
     return f'{machine}, commit {commit[:12]}{" (changed since)" if dirty else ""}'
 
 
-def changed_parameters(config: Config) -> dict[str, Any]:
-    """Parameters that differ from their defaults, by dotted name."""
-    return {spec.name: value for spec, _, value in Config().differences(config)}
-
-
-def parameters_line(changes: Mapping[str, Any]) -> str:
-    """One line on the parameters of a run."""
-    words = ', '.join(f'{name}={value}' for name, value in changes.items())
-    return f'parameters: {words or "defaults"}'
-
-
 def _cpu_name() -> str:
-    try:
-        lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
-    except OSError:
-        lines = []
-    names = (line.partition(':')[2].strip() for line in lines if line.startswith('model name'))
-    return next(names, platform.processor() or platform.machine())
+    with suppress(OSError):
+        for line in Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines():
+            if line.startswith('model name'):
+                return line.partition(':')[2].strip()
+    return platform.machine()
 
 
 def _commit(source: Path) -> str | None:
@@ -171,42 +213,16 @@ def _commit(source: Path) -> str | None:
 
     An installed package may lie inside another repository, whose commit says nothing of it.
     """
-    if _git(source.parent, 'ls-files', '--error-unmatch', source.name) is None:
-        return None
-    return _git(source.parent, 'describe', '--always', '--abbrev=40', '--dirty', '--exclude=*')
-
-
-def _git(folder: Path, *words: str) -> str | None:
-    try:
-        run = subprocess.run(
-            ['git', *words], cwd=folder, capture_output=True, text=True, timeout=10.0
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return run.stdout.strip() if run.returncode == 0 else None
-
-
-class Report(NamedTuple):
-    """Tables to show, every number by scan or segment, the backend, and further facts."""
-
-    tables: dict[str, Table]
-    rows: list[dict[str, Any]]
-    backend: str
-    facts: dict[str, Any]
-
-    def text(self, machine: str, *, markdown: bool) -> str:
-        """Return the tables, and below them the line on the machine."""
-        tables = self.tables.values()
-        shown = [table.markdown() if markdown else table.text() for table in tables]
-        return '\n\n'.join([*shown, machine if markdown else fold(machine)])
-
-    def write(self, path: Path, environment: dict[str, Any]) -> None:
-        """Write every number as JSON."""
-        document = {
-            **self.facts,
-            'backend': self.backend,
-            'environment': environment,
-            **{name: table.json() for name, table in self.tables.items()},
-            'rows': self.rows,
-        }
-        write_file(path, (json.dumps(document, indent=2, allow_nan=False) + '\n').encode())
+    said = ''
+    for words in (
+        ('ls-files', '--error-unmatch', source.name),
+        ('describe', '--always', '--abbrev=40', '--dirty', '--exclude=*'),
+    ):
+        try:
+            said = subprocess.run(
+                ['git', *words], cwd=source.parent, check=True, capture_output=True, text=True,
+                timeout=10.0,
+            ).stdout.strip()  # fmt: skip
+        except (OSError, subprocess.SubprocessError):
+            return None
+    return said

@@ -15,14 +15,14 @@ import numpy as np
 
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.lab.scoring import metrics, objects
-from gp_ground_seg.lab.scoring.evaluate import ALL, KEYS, Scores, sums, title_of, with_all
+from gp_ground_seg.lab.scoring.evaluate import ALL, KEYS, STAGE, Scores, sums, with_all
 from gp_ground_seg.lab.scoring.metrics import COUNTS, Measure, ratio, share
 from gp_ground_seg.lab.scoring.report import (
     PEER,
+    SHARE,
     Form,
     Report,
     Table,
-    changed_parameters,
     frame_of,
     records,
 )
@@ -44,50 +44,11 @@ MEASURES: dict[str, Measure] = {
     'share_lost': share('n_lost', 'n_objects'),
     **{name: share(f'{name}_wrong', f'{name}_n') for name in objects.SHARES},
     **metrics.HEIGHT_MEASURES,
-    'seconds': share('seconds', 'n_scans'),
 }
 """What is measured of sums over scans."""
-IOU, RMSE = MEASURES['iou'], MEASURES['rmse']
+IOU = MEASURES['iou']
 HEIGHTS = 'without_model', 'bias', 'rmse', 'median_absolute', 'within_1', 'within_2'
 """Measures of the heights that are shown."""
-SHARE, SIGNED, COUNT = ('.2f', 100.0), ('+.2f', 100.0), (',.0f',)
-"""Formats and factors: of ratios in percent, and of metres in cm; of their differences; counts."""
-FORMS = {
-    'n_scans': Form('frames', *COUNT),
-    'points': Form('points', *COUNT),
-    'precision': Form('precision', *SHARE),
-    'recall': Form('recall', *SHARE),
-    'f1': Form('F1', *SHARE),
-    'accuracy': Form('accuracy', *SHARE),
-    'iou': Form('IoU', *SHARE),
-    'difference': Form('difference', *SIGNED),
-    'interval': Form('95 % interval'),
-    'errors': Form('errors', *COUNT),
-    'share_of_errors': Form('of errors', *SHARE),
-    'n_returns': Form('returns', *COUNT),
-    'share_ground': Form('as ground', *SHARE),
-    'n_unknown': Form('no ground near', *COUNT),
-    'n_objects': Form('objects', *COUNT),
-    'n_lost': Form('lost', *COUNT),
-    'low_things_n': Form('low returns', *COUNT),
-    'low_things': Form('as ground', *SHARE),
-    'road_cells_n': Form('road cells', *COUNT),
-    'road_cells': Form('false', '.3f', 100.0),
-    'ground_cells_n': Form('ground cells', *COUNT),
-    'ground_cells': Form('false', '.3f', 100.0),
-    'n_points': Form('points', *COUNT),
-    'without_model': Form('no model', *SHARE),
-    'bias': Form('bias', *SHARE),
-    'rmse': Form('RMSE', *SHARE),
-    'median_absolute': Form('median', *SHARE),
-    'within_1': Form('in 1 std', '.1f', 100.0),
-    'within_2': Form('in 2 std', '.1f', 100.0),
-    'ece': Form('ECE', '.4f'),
-    'median': Form('median', '.1f', 1e3),
-    'mean': Form('mean', '.1f', 1e3),
-    'ratio': Form('ours / this', '.2f'),
-}
-"""How columns are shown, by their name in JSON."""
 COMPARED = {
     'iou': 'IoU [%]',
     'precision': 'precision [%]',
@@ -98,7 +59,6 @@ COMPARED = {
     'rmse': 'RMSE of the height [cm]',
     'within_1': 'heights within 1 std, ideally 68.3 [%]',
     'within_2': 'heights within 2 std, ideally 95.4 [%]',
-    'seconds': 'time per frame, mean [ms]',
 }
 """Measures of which the differences have an interval."""
 
@@ -155,14 +115,13 @@ def interval_text(
     measure: Measure,
     frame: DataFrame | None = None,
     ours: str = '',
-    scale: float = 100.0,
 ) -> str | None:
-    """`difference_interval` times `scale`, as in ``-0.10 to +0.25 tie``; None without one."""
+    """`difference_interval` in percent or cm, as in ``-0.10 to +0.25 tie``; None without one."""
     found = difference_interval(scores, other, measure, frame, ours)
     if found is None:
         return None
     low, high = found
-    return f'{scale * low:+.2f} to {scale * high:+.2f}' + ' tie' * (low <= 0.0 <= high)
+    return f'{100.0 * low:+.2f} to {100.0 * high:+.2f}' + ' tie' * (low <= 0.0 <= high)
 
 
 def interval_note(scores: Scores) -> str:
@@ -177,16 +136,16 @@ def interval_note(scores: Scores) -> str:
     return f'95 % interval: bootstrap over {n} {kind}{few}; tie: it holds 0'
 
 
-def beside(found: DataFrame, methods: list[str], *compared: str) -> DataFrame:
-    """Return the rows of ours, with each column `compared` of the other method after that of ours.
+def beside(found: DataFrame, scores: Scores, *compared: str) -> DataFrame:
+    """Return the rows of ours, with each column `compared` of the peer after that of ours.
 
     `found` has the methods in the first level of its index. If ``iou`` is compared, the last
-    column is the difference. Without another method there is nothing to compare.
+    column is the difference. Without a peer there is nothing to compare.
     """
-    ours = found.loc[methods[0]]
-    if not methods[1:]:
+    ours = found.loc[scores.methods[0]]
+    if not scores.peer:
         return ours
-    peer = found.loc[methods[1], [name for name in compared if name in found]].add_prefix(PEER)
+    peer = found.loc[scores.peer, [name for name in compared if name in found]].add_prefix(PEER)
     both = ours.join(peer)
     both = both[[
         column for name in ours for column in (name, f'{PEER}{name}') if column in both
@@ -215,27 +174,18 @@ def measured(rows: DataFrame, *by: str) -> DataFrame:
     return found
 
 
-def make_report(tables: dict[str, Table], scores: Scores, base: Config, **facts: Any) -> Report:
-    """Report of scored variants; `base` is what they change, the first is of our method.
-
-    Its rows are the scans, with all sums and measures.
-    """
-    stages = scores.times.groupby('method', sort=False).median(numeric_only=True)
-    given = {
-        'config_changes': changed_parameters(base),
-        'config': base.nested(),
-        'stages': stages.to_dict('index'),
-    }
-    backend = str(scores.scans['backend'].iloc[0])
-    return Report(tables, records(with_measures(scores.scans)), backend, {**given, **facts})
+def make_report(tables: dict[str, Table], scores: Scores, config: Config) -> Report:
+    """Report of scored variants of `config`; its rows are the scans, with sums and measures."""
+    rows = records(with_measures(scores.scans))
+    return Report(tables, rows, str(scores.scans['backend'].iloc[0]), config)
 
 
 def peer_note(scores: Scores, note: str = '') -> str:
     """Say in a title which method the peer is, and more of it."""
-    return ''.join(f'; peer: {title_of(name)}{note}' for name in scores.methods[1:])
+    return f'; peer: {scores.peer}{note}' if scores.peer else ''
 
 
-def evaluation(scores: Scores, config: Config, n_workers: int = 0) -> Report:
+def evaluation(scores: Scores, config: Config) -> Report:
     """Report of our method with `config`, and of at most one other method on the same scans.
 
     Scans without labels have tables of time and of differing labels only.
@@ -246,19 +196,14 @@ def evaluation(scores: Scores, config: Config, n_workers: int = 0) -> Report:
         tables['rings'] = _ring_table(scores)
     if len(scores.objects):
         tables['objects'] = _object_table(scores)
-    if scores.methods[1:]:
+    if scores.peer:
         tables['measures'] = difference_table(scores)
-    tables['times'] = _time_table(scores, n_workers)
-    bins = sums(with_all(scores.bins), 'sequence', 'bin').reset_index()
-    return make_report(tables, scores, config, reliability=records(bins))
+    return make_report({**tables, **time_tables(scores, scores.peer)}, scores, config)
 
 
 def _sequence_tables(scores: Scores) -> dict[str, Table]:
     """Labels, shares and heights by sequence and pooled. A further measure is a column here."""
-    rows = with_all(scores.scans)
-    found = measured(rows, 'sequence')
-    bins = sums(with_all(scores.bins), 'sequence', 'bin').groupby(['method', 'sequence'])
-    found['ece'] = bins[['n', 'n_ground', 'p']].apply(metrics.calibration_error)
+    found = measured(with_all(scores.scans), 'sequence')
     shares = [column for name in objects.SHARES for column in (f'{name}_n', name)]
     parts = {
         'groundgrid': (
@@ -271,15 +216,14 @@ def _sequence_tables(scores: Scores) -> dict[str, Table]:
         ),
         'heights': (
             'Height of the ground under returns labelled ground [cm]; shares without a model and '
-            'within one and two standard deviations [%]; calibration error of the probabilities',
-            ['n_points', *HEIGHTS, 'ece'], ['rmse'],
+            'within one and two standard deviations [%]',
+            ['n_points', *HEIGHTS], ['rmse'],
         ),
     }  # fmt: skip
     return {
         name: Table(
             title + peer_note(scores),
-            beside(found[columns], scores.methods, *compared).reset_index(),
-            FORMS,
+            beside(found[columns], scores, *compared).reset_index(),
         )
         for name, (title, columns, compared) in parts.items()
     }
@@ -294,14 +238,14 @@ def _ring_table(scores: Scores) -> Table:
     whole = found.loc[(scores.methods[0], ALL), 'errors']
     found['share_of_errors'] = ratio(found['errors'], whole)
     found = found[['points', 'errors', 'share_of_errors', 'precision', 'recall', 'iou']]
-    table = beside(found, scores.methods, 'iou').loc[[*metrics.RING_TITLES, ALL]]
+    table = beside(found, scores, 'iou').loc[[*metrics.RING_TITLES, ALL]]
     title = 'IoU'
-    for peer in scores.methods[1:]:
+    if peer := scores.peer:
         parts = dict(iter(rows.groupby('range')))
         table['interval'] = [interval_text(scores, peer, IOU, parts[band]) for band in table.index]
-        title = f'IoU minus that of {title_of(peer)}, {interval_note(scores)},'
+        title = f'IoU minus that of {peer}, {interval_note(scores)},'
     title += ' by horizontal range (GroundGrid convention) [%]'
-    return Table(title, table.reset_index(), FORMS)
+    return Table(title, table.reset_index())
 
 
 def _object_table(scores: Scores) -> Table:
@@ -314,39 +258,33 @@ def _object_table(scores: Scores) -> Table:
     ]  # fmt: skip
     found = measured(rows, 'class', 'range')
     found['n_lost'] = found['n_lost'].where(found['n_objects'] > 0)
-    found = found[['n_returns', 'share_ground', 'n_objects', 'n_lost', 'n_unknown']]
-    table = beside(found, scores.methods, 'share_ground', 'n_lost').loc[places]
+    found = found[['n_returns', 'share_ground', 'n_objects', 'n_lost']]
+    table = beside(found, scores, 'share_ground', 'n_lost').loc[places]
     title = 'Objects: returns on them, and the share called ground [%]; objects, and those lost'
-    for peer in scores.methods[1:]:
+    if peer := scores.peer:
         ground = MEASURES['share_ground']
         table['interval'] = [interval_text(scores, peer, ground, parts[k]) for k in places]
         title += peer_note(scores, f'; of the share as ground: {interval_note(scores)}')
-    return Table(title, table.reset_index(), FORMS)
+    return Table(title, table.reset_index())
 
 
 def difference_table(scores: Scores) -> Table:
     """Compare two methods by `COMPARED`; measures without data in the scans are left out."""
-    other = scores.methods[1]
+    other = scores.peer
     found = measured(scores.scans).loc[[scores.methods[0], other]]
     found = found[[name for name in COMPARED if name in found]].dropna(axis='columns', how='all')
-    scales = [1e3 if name == 'seconds' else 100.0 for name in found]
     rows = [
         {
             'measure': COMPARED[name],
             'given': given,
             'peer': peer,
             'difference': given - peer,
-            'interval': interval_text(scores, other, MEASURES[name], scale=scale),
+            'interval': interval_text(scores, other, MEASURES[name]),
         }
-        for (name, (given, peer)), scale in zip(found.items(), scales, strict=True)
+        for name, (given, peer) in found.items()
     ]
-    forms = {
-        'given': Form('given', '.2f', scales),
-        'peer': Form(title_of(other), '.2f', scales),
-        'difference': Form('difference', '+.2f', scales),
-        'interval': FORMS['interval'],
-    }
-    title = f'Given minus {title_of(other)}; {interval_note(scores)}'
+    forms = {'given': Form('given', *SHARE), 'peer': Form(other, *SHARE)}
+    title = f'Given minus {other}; {interval_note(scores)}'
     return Table(title, frame_of(rows), forms, [_changed_note(scores.scans, other)])
 
 
@@ -361,12 +299,34 @@ def _changed_note(scans: DataFrame, other: str) -> str:
     return f'points with two labels: {whole:.2%}; most in {named}'
 
 
-def _time_table(scores: Scores, n_workers: int) -> Table:
-    """Time of a frame, and in a note that of the stages of ours."""
-    table = scores.scans.groupby('method', sort=False)['seconds'].agg(['median', 'mean'])
-    table['ratio'] = table['median'].iloc[0] / table['median']
-    own = scores.times[scores.times['method'] == scores.methods[0]].drop(columns=[*KEYS])
-    stages = ', '.join(f'{name} {1e3 * s:.1f}' for name, s in own.median().items())
-    together = f', by {n_workers} workers at once' if n_workers else ''
-    title = f'Time per frame, reading left out{together} [ms]'
-    return Table(title, table.rename(index=title_of).reset_index(), FORMS, [f'stages: {stages}'])
+def time_tables(
+    scores: Scores, peer: str = '', title: str = 'Time per frame, reading left out'
+) -> dict[str, Table]:
+    """Median and 99 % quantile of the time of each method, and the stages of ours.
+
+    The ratio to a `peer` is the median of those frame by frame: it holds although the speed of
+    the machine drifts.
+    """
+    scans = scores.scans
+    runs = scans.assign(run=scans.groupby('method').cumcount())
+    seconds = runs.pivot(index='run', columns='method', values='seconds')[scores.methods]
+    table = seconds.median().to_frame('median').assign(p99=seconds.quantile(0.99))
+    forms = dict[str, Form]()
+    if peer:
+        table['ratio'] = seconds.div(seconds[peer], axis='index').median()
+        table['p99_ratio'] = table['p99'] / table['median'][peer]
+        forms['ratio'] = Form(f'/ {peer}', '.2f')
+        forms['p99_ratio'] = Form(f'p99 / {peer} median', '.2f')
+    names = [name for name in scans if name.startswith(STAGE)]
+    ours = scans[scans[names].notna().any(axis='columns')]
+    stages = ours[names].assign(rest=ours['seconds'] - ours[names].sum(axis='columns'))
+    medians = stages.groupby(ours['method'], sort=False).median()
+    medians = medians.rename(columns=lambda name: name.removeprefix(STAGE))
+    of_stage = {name: Form(name, '.2f', 1e3) for name in medians}
+    return {
+        'times': Table(title, table.reset_index(), forms),
+        'stages': Table(
+            'Stages of a frame', medians.reset_index(),
+            {**of_stage, 'method': Form('stage, median [ms]')},
+        ),
+    }  # fmt: skip
