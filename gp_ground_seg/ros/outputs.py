@@ -36,7 +36,7 @@ LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
 OUTPUT_DEPTH = 20  # messages kept: Fast DDS may send a lost fragment again after 0.7 s only
 LONGEST_PERIOD = 1.0
-"""Time between two clouds from which it says nothing of the sensor [s]: clouds are missing."""
+"""Time between two clouds [s] from which on some are missing: ``scan_time`` is 0 then."""
 
 
 class Output(NamedTuple):

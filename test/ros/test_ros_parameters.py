@@ -112,6 +112,7 @@ def test_a_change_takes_effect_with_the_next_cloud(b, tmp_path):
         ('grid.n_segments', 90.0, 'grid.n_segments = 90.0: must be an integer in [4, 2048]'),
         ('runtime.backend', 'gpu', "runtime.backend = 'gpu': must be one of auto, numba, numpy"),
         ('grid.r_max', 1.5, 'grid.r_min = 2: must be below grid.r_max = 1.5'),
+        ('input.crop_box', [1.0, -1.0, 0.0, 1.0, 0.0, 1.0], 'must be none or six numbers in ['),
         ('lable.ground_tolerance', 0.1, 'did you mean label.ground_tolerance?'),
     ],
 )
@@ -168,6 +169,12 @@ def test_an_integer_is_taken_for_any_number(b, setter):
         (found,) = values_of(b, [name]).values()
         assert (type(found), found) == (float, value)
         assert b.node.config[name] == value
+
+
+def test_a_box_may_come_as_text(b):
+    """As ``ros2 param set`` sends whole numbers among others."""
+    assert b.set('input.crop_box', '[-1, 1.0, -1.0, 1.0, -1.6, 0.6]').successful
+    assert b.node.config.input.crop_box == (-1.0, 1.0, -1.0, 1.0, -1.6, 0.6)
 
 
 def test_a_fault_in_the_check_is_answered_and_the_node_lives(b, monkeypatch):

@@ -32,8 +32,8 @@ FILES = {
     HEAD + '    use_sim_time: "yes"\n': 'must be true or false',
     HEAD + '    grid:\n': 'No value at line 3',
     HEAD + '    grid: {n_bins: [1, 2.5]}\n': 'should be of same type',
-    'label: {ground_tolerance: 0.1}\n': 'd.yaml: no ros__parameters; bare groups are good for',
-    '/**:\n  a:\n    grid: {n_bins: 50}\n': 'd.yaml: no ros__parameters; gp-ground-seg config',
+    'label: {ground_tolerance: 0.1}\n': 'd.yaml: no ros__parameters, which the node needs',
+    '/**:\n  a:\n    grid: {n_bins: 50}\n': 'd.yaml: no ros__parameters',
     'just words\n': 'd.yaml: no ros__parameters',
     HEAD + '  label: [ {a\n': 'd.yaml: not valid YAML',
     '/**:\n\tros__parameters:\n': 'd.yaml: not valid YAML',
@@ -143,14 +143,13 @@ def test_a_file_is_unused_where_rcl_takes_nothing_of_it(tmp_path, text):
 
 def test_unused_files_are_warned_of_with_their_keys(tmp_path):
     words = []
-    for name, keys in (('a\x1b[2J', ['b', '/c/d']), ('used', ['/**']), ('many', range(13))):
+    for name, keys in (('a\x1b[2J', ['b', '/c/d']), ('used', ['/**'])):
         path = tmp_path / f'{name}.yaml'
         path.write_text(''.join(f'{key}:\n  ros__parameters: {{}}\n' for key in keys))
         words += ['--params-file', str(path)]
-    first, last = unused_files([*words, '--params-file', 'gone.yaml'], '/front/filter')
+    (first,) = unused_files([*words, '--params-file', 'gone.yaml'], '/front/filter')
     assert first.startswith(rf'{tmp_path}/a\x1b[2J.yaml: not used: ')
     assert 'those of b, /c/d, and this node is /front/filter' in first
-    assert 'those of 0, 1, ' in last and '9, 3 more, and' in last
     words = *FIXED, '-p', 'runtime.backend:=numpy', *words[:2]
     with Process(*words, folder=tmp_path) as node:
         node.wait_until_ready('not used')
