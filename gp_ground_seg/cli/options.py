@@ -227,8 +227,7 @@ def count(number: int, noun: str) -> str:
 
 def progress(title: str, *, quiet: bool = False, unit: str = 'frame') -> partial[tqdm[Any]]:
     """Progress of items, or of a `total`, on standard error; in a file every half minute."""
-    period = 0.1 if sys.stderr.isatty() else LINE_PERIOD
-    waits = {'mininterval': period, 'maxinterval': max(10.0, period), 'delay': period}
-    return partial(
-        tqdm, desc=title, unit=unit, file=sys.stderr, disable=quiet, leave=False, **waits
-    )
+    own = {'desc': title, 'unit': unit, 'file': sys.stderr, 'disable': quiet, 'leave': False}
+    if not sys.stderr.isatty():
+        own |= dict.fromkeys(('mininterval', 'maxinterval', 'delay'), LINE_PERIOD)
+    return partial(tqdm, **own)
