@@ -2,49 +2,17 @@
 
 import numpy as np
 import pytest
-import reference_gp
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg.core.compiled import numerics
 from gp_ground_seg.core.compiled.numerics import exp_neg
-from gp_ground_seg.core.gp import kernels as covariances
 from gp_ground_seg.core.gp.kernels import (
     SEGMENTS_PER_BATCH,
     Padded,
     batches,
-    paciorek,
-    squared_exponential,
 )
 from gp_ground_seg.core.jit import JIT_ENABLED
-
-
-def kernels(r_a, l_a, r_b, l_b, sigma_f):
-    """Of `gp.kernels`, and of the reference."""
-    found = paciorek(r_a[:, None], l_a[:, None], r_b, l_b, sigma_f**2)
-    return found, reference_gp.paciorek(r_a, l_a, r_b, l_b, sigma_f)
-
-
-def random_inputs(seed, n):
-    rng = np.random.default_rng(seed)
-    return np.sort(rng.uniform(2, 60, n)), rng.uniform(0.5, 30, n)
-
-
-@given(st.integers(0, 10_000), st.integers(1, 25), st.floats(0.05, 3.0))
-def test_kernel_contract(seed, n, sigma_f):
-    r, length_scale = random_inputs(seed, n)
-    k, expected = kernels(r, length_scale, r, length_scale, sigma_f)
-    np.testing.assert_allclose(k, expected, rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(k, k.T)
-    np.testing.assert_allclose(np.diag(k), sigma_f**2)
-    assert np.linalg.eigvalsh(k).min() > -1e-9 * sigma_f**2 * n
-    # A constant length-scale gives the squared exponential.
-    same = np.full(n, 4.0)
-    stationary = sigma_f**2 * np.exp(-((r[:, None] - r) ** 2) / (2 * 4.0**2))
-    ours = squared_exponential(r[:, None], r, sigma_f**2, 0.5 / 4.0**2)
-    plain = reference_gp.squared_exponential(r, r, sigma_f, 4.0)
-    for k in (*kernels(r, same, r, same, sigma_f), ours, plain):
-        np.testing.assert_allclose(k, stationary, rtol=1e-12, atol=1e-15)
 
 
 @given(st.lists(st.integers(0, 20), max_size=100))
@@ -99,15 +67,6 @@ def test_exp_neg_in_single_precision(x):
     expected = np.exp(-np.float64(x))
     assert abs(found - expected) <= 6e-8 + 1.5e-7 * (1.0 - expected)
     assert (found == 0.0) == (x >= numerics.NEGLIGIBLE_SINGLE)
-
-
-def test_compiled_code_takes_the_form_of_the_precision_at_hand():
-    exponential = compiled(lambda x: covariances.exp_neg(x))
-    for x in (0.3, 2.0, 17.0):
-        single = exponential(np.float32(x))
-        assert exponential(x) == pytest.approx(np.exp(-x), rel=1e-14)
-        assert single == pytest.approx(np.exp(-np.float64(np.float32(x))), abs=2e-7)
-        assert not JIT_ENABLED or single == numerics.exp_neg_single(np.float32(x))
 
 
 def positive_definite(n, seed):

@@ -77,7 +77,7 @@ def learn(inliers, space, start, use_priors=True, max_evaluations=200):
     return Learned.of(theta, float(outcome[0]), n, int(outcome[1]), space), values
 
 
-@pytest.mark.parametrize('seed', [0, 1, 2])
+@pytest.mark.parametrize('seed', [0, 1])
 def test_noise_and_length_scales_of_a_drawn_frame_are_recovered(seed):
     inliers, truth = draw_inliers(seed)
     # Far off: half the amplitude, twice the noise, short length-scales.
@@ -176,13 +176,12 @@ def test_space_follows_the_configuration(changes, n_free):
 N_POINTS = fewer(4000, 400)
 
 
-@pytest.mark.parametrize('seed', range(fewer(3, 1)))
 @pytest.mark.parametrize('factor', [0.1, 10.0])
-def test_what_is_learned_does_not_hang_on_the_given_values(factor, seed):
+def test_what_is_learned_does_not_depend_on_the_given_values(factor):
     names = 'observation.sigma_f', 'observation.sigma_n'
     given = Config()
     wrong = given.replace(**{name: given[name] * factor for name in names})
-    scan = hilly_scan(30_000, seed)
+    scan = hilly_scan(30_000)
     ours, theirs = (
         GroundSegmenter(config, backend=MODEL).segment(scan).fit.theta for config in (given, wrong)
     )
