@@ -1,4 +1,4 @@
-"""Covariance functions, segments padded into batches, and the numerics of compiled code."""
+"""The numerics of compiled code."""
 
 import numpy as np
 import pytest
@@ -7,35 +7,7 @@ from hypothesis import strategies as st
 
 from gp_ground_seg.core.compiled import numerics
 from gp_ground_seg.core.compiled.numerics import exp_neg
-from gp_ground_seg.core.gp.kernels import (
-    SEGMENTS_PER_BATCH,
-    Padded,
-    batches,
-)
 from gp_ground_seg.core.jit import JIT_ENABLED
-
-
-@given(st.lists(st.integers(0, 20), max_size=100))
-def test_batches_hold_every_segment_once_and_similar_sizes_together(counts):
-    offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-    values = np.arange(offsets[-1]) + 0.5
-    found = batches(offsets)
-    taken = np.sort(np.concatenate([np.empty(0, dtype=int), *found]))
-    np.testing.assert_array_equal(taken, np.flatnonzero(counts))
-    longest = 0
-    for segments in found:
-        assert len(segments) <= SEGMENTS_PER_BATCH
-        padded = Padded.of(segments, offsets)
-        assert padded.mask.sum(axis=1).min() >= longest
-        longest = padded.mask.shape[1]
-        for row, mask, m in zip(padded.take(values, -1.0), padded.mask, segments, strict=True):
-            np.testing.assert_array_equal(row[mask], values[offsets[m] : offsets[m + 1]])
-            assert (row[~mask] == -1.0).all()
-    nothing = Padded.of(np.array([0]), np.array([0, 0]))
-    assert nothing.take(values).shape == (1, 0)
-
-
-# Numerics of the compiled code.
 
 
 def compiled(function):

@@ -24,12 +24,6 @@ CONFIG = Config().replace(
 KNOTS = np.array([2.0, 4.0, 6.0, 8.0, 10.0])
 KNOTS.setflags(write=False)
 LEVEL = Relief.level()
-G, O, U = Label.GROUND, Label.OBSTACLE, Label.UNKNOWN  # noqa: E741
-
-
-def surface_of(heights=(0.0,) * 5):
-    mean = np.tile(np.asarray(heights, dtype=float), (4, 1))
-    return GroundSurface(KNOTS, mean, np.full((4, 5), 0.1), np.ones(0, dtype=bool))
 
 
 def ground_about(side, std, rng):
@@ -38,14 +32,13 @@ def ground_about(side, std, rng):
     return np.column_stack([x.ravel(), y.ravel(), np.abs(rng.normal(0.0, std, x.size))])
 
 
-def labels_of(backend, points, r_max=12.0, **changes):
+def labels_of(backend, points):
     """Labels and margins of points (N, 3) over a level surface."""
-    config = CONFIG.replace(**{'grid.r_max': r_max, 'grid.r_min': 0.1 * r_max, **changes})
-    knots = np.linspace(0.1 * r_max, r_max, 5)
-    surface = surface_of()._replace(knots=knots)
+    config = CONFIG.replace(**{'grid.r_max': 12.0, 'grid.r_min': 1.2})
+    mean, std = np.zeros((4, 5)), np.full((4, 5), 0.1)
+    surface = GroundSurface(np.linspace(1.2, 12.0, 5), mean, std, np.ones(0, dtype=bool))
     scan = backend.build_grid(points, config)
-    faces = Faces.none(scan.tiles)
-    return backend.label_points(scan, faces, surface, LEVEL, config)
+    return backend.label_points(scan, Faces.none(scan.tiles), surface, LEVEL, config)
 
 
 @pytest.mark.parametrize('std', [0.0, 0.03])

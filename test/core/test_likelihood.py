@@ -2,12 +2,10 @@
 
 import functools
 import math
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import reference_gp
-from conftest import compiled_log_likelihood
 
 from gp_ground_seg.core.frame import Inliers
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
@@ -104,24 +102,3 @@ def test_beyond_the_bound_of_length_scales_nothing_depends_on_the_latent_process
     beyond = TYPICAL.copy()
     beyond[5:] = MAX_ABS_LOG_LENGTH_SCALE + 10.0
     assert not likelihood(beyond, inliers, 0.05, False)[1][2:].any()
-
-
-def test_results_do_not_depend_on_where_the_arrays_lie():
-    """The arrays of a small segment lie side by side."""
-    pytest.importorskip('numba')
-    rng = np.random.default_rng(9)
-    thread = ThreadPoolExecutor(1)
-    for _ in range(100):
-        n, n_bar = rng.integers(2, 9), rng.integers(8, 13)
-        in_one, bars_in_one = np.zeros((2, 7), dtype=np.int64)
-        place = rng.integers(1, 7)
-        in_one[place:], bars_in_one[place:] = n, n_bar
-        r, r_bar = (np.sort(rng.uniform(3, 20, size)) for size in (n, n_bar))
-        z, log_extent = rng.normal(0, 0.5, n), rng.choice([0.0, 0.5, 1.2], n_bar)
-        kind = rng.integers(0, 9, n_bar)
-        inliers = Inliers(in_one, r, z, np.zeros(n), bars_in_one, r_bar, log_extent, kind)
-        # Here, and in a thread, which has memory of its own.
-        arguments = TYPICAL, inliers, 0.05, False
-        value, gradient = compiled_log_likelihood(*arguments)
-        other, also = thread.submit(compiled_log_likelihood, *arguments).result()
-        assert (value, gradient.tobytes()) == (other, also.tobytes())

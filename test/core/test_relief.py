@@ -119,13 +119,10 @@ def box(x0, x1, y0, y1, high):
 
 
 LEVEL_LAND = {
-    'road': lambda x, y: 0.0 * x,
     'camber': lambda x, y: -0.1 * np.abs(y / 40.0),
-    'car': box(6.0, 10.5, 2.0, 3.8, 1.5),
     'bonnet': lambda x, y: box(6.0, 10.0, 2.0, 3.8, 0.9)(x, y) * (1.0 - 0.1 * (x - 6.0)),
     'truck': box(8.0, 20.0, 3.0, 5.5, 3.2),
     'pallets': box(5.0, 9.0, -2.0, 2.0, 0.2),
-    'wall': box(12.0, 12.6, -30.0, 30.0, 2.5),
     'hole': box(8.0, 11.0, 0.0, 4.0, -1.5),
     'terrace': lambda x, y: 1.2 * (x > 9.0),
 }
