@@ -231,10 +231,8 @@ def test_the_digest_covers_every_file_that_compiled_code_is_made_from():
 def test_few_scans_do_not_wait_for_the_compiler(tmp_path):
     """They are segmented with numpy, and have its labels."""
     scan(1).tofile(tmp_path / 'a.bin')
-    labels, env = (
-        [],
-        os.environ | {'NUMBA_CACHE_DIR': str(tmp_path / 'none'), 'NUMBA_DISABLE_JIT': '0'},
-    )
+    labels, cache = [], str(tmp_path / 'none')
+    env = os.environ | {'NUMBA_CACHE_DIR': cache, 'NUMBA_DISABLE_JIT': '0'}
     for more, n_notes in ([], 1), (['--set', 'runtime.backend=numpy'], 0):
         words = 'segment', 'a.bin', '-o', 'a.label', '--force', *more
         process = start(*words, cwd=tmp_path, env=env)
