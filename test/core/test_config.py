@@ -60,16 +60,6 @@ def test_declarations_are_complete(spec):
     assert is_of_declared_type(spec, default)
 
 
-def test_the_basic_parameters():
-    """Those at the top of docs/parameters.md; changing this list changes what users see first."""
-    assert len(SPECS) == 69
-    assert [spec.name for spec in SPECS if spec.basic] == [
-        'sensor.height', 'sensor.roll', 'sensor.pitch', 'frame.level', 'frame.base',
-        'input.crop_box', 'grid.n_segments', 'grid.r_max', 'growth.seed_height_tolerance',
-        'label.ground_tolerance', 'learning.mode',
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize('spec', NUMBERS, ids=by_name)
 def test_numbers_refuse_what_is_none_or_out_of_range(spec):
     words = ['1', 'Auto', 'none', *([] if spec.auto else ['auto'])]

@@ -10,7 +10,6 @@ from conftest import REPOSITORY, load_script
 from hypothesis import given, settings
 
 from gp_ground_seg import Config, ConfigError
-from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import PRESETS, find_preset, parameter_specs
 
 GENERATE = 'run: make generate'
@@ -37,30 +36,6 @@ def test_yaml_reads_back_in_the_types_that_ros_wants(tmp_path_factory, config):
             assert type(value) is spec.type or (spec.auto and value == 'auto')
 
 
-def test_every_parameter_is_explained_above_it():
-    lines = Config().to_yaml().splitlines()
-    assert max(len(line) for line in lines) <= 99
-    assert all(line == line.rstrip() for line in lines)
-    specs = iter(parameter_specs())
-    words = ''
-    for line in (line for line in lines if line.startswith('      ')):
-        if line[6] == '#':
-            words += line.strip(' #') + ' '
-            continue
-        spec = next(specs)
-        assert line.startswith(f'      {spec.name.split(".")[1]}: ')
-        assert all(part in words for part in (spec.description, spec.unit, spec.symbol))
-        if spec.type in (int, float):
-            assert f'[{spec.minimum:g}, {spec.maximum:g}]' in words
-        else:
-            box = 'none or six numbers in [-100, 100] m'
-            words_of = {bool: ['true or false'], tuple: [box]}
-            expected = words_of.get(spec.type, spec.choices or ['(a name)'])
-            assert all(choice in words for choice in expected)
-        words = ''
-    assert next(specs, None) is None
-
-
 def test_generated_files_are_up_to_date():
     files = generate.generated_files((REPOSITORY / 'README.md').read_text(encoding='utf-8'))
     assert set(files) == {
@@ -71,21 +46,6 @@ def test_generated_files_are_up_to_date():
     assert {f'config/{path.name}' for path in (REPOSITORY / 'config').glob('*.yaml')} <= set(files)
 
 
-def test_the_table_has_a_row_for_each_parameter_that_people_set():
-    table = generate.to_markdown_table()
-    header, rule, *rows = table.splitlines()
-    assert set(rule) <= set('| -')
-    specs = [spec for spec in parameter_specs() if spec.basic]
-    for row, spec in zip(rows, specs, strict=True):
-        cells = row.replace(r'\|', '\0').split('|')
-        assert len(cells) == len(header.split('|'))
-        cells = [cell.strip().replace('\0', '|') for cell in cells[1:-1]]
-        assert cells[0] == f'`{spec.name}`'
-        assert yaml.safe_load(cells[1].strip('`')) == spec.default
-        assert spec.unit in cells[2].split(']')[-1]
-        assert cells[3] == spec.description + f' (`{spec.symbol}`)' * bool(spec.symbol)
-
-
 def test_the_page_of_parameters_has_its_table_and_all_parameters():
     files = generate.generated_files(''.join(generate.marks_of(generate.SCORES)))
     source = [files['docs/parameters.md']]
@@ -94,14 +54,6 @@ def test_the_page_of_parameters_has_its_table_and_all_parameters():
     assert table.endswith(generate.to_markdown_table()) and listing == ''
     (path,) = re.findall('^```{literalinclude} (.*)$', source[0], re.MULTILINE)
     assert (REPOSITORY / 'docs' / path).samefile(REPOSITORY / 'config' / 'default.yaml')
-
-
-@pytest.mark.parametrize('marks', ['', 'b', 'e', 'eb', 'bbe', 'bee'])
-def test_the_readme_needs_its_markers(marks):
-    begin, end = generate.marks_of('scores')
-    readme = '\n'.join({'b': begin, 'e': end}[mark] for mark in marks)
-    with pytest.raises(DataError, match=f'{begin} and {end} once each'):
-        generate.with_table(readme, 'scores', '')
 
 
 def test_the_presets_are_those_promised_and_another_is_refused():
@@ -115,18 +67,11 @@ def test_the_presets_are_those_promised_and_another_is_refused():
             find_preset(wrong)
 
 
-@pytest.mark.parametrize('preset', PRESETS.values(), ids=lambda preset: preset.name)
-def test_a_dumped_preset_is_its_file_with_a_reason_for_every_override(preset, capsys):
-    assert run('config', 'dump', '--preset', preset.name) == 0
-    text = (REPOSITORY / 'config' / f'{preset.name}.yaml').read_text(encoding='utf-8')
+@pytest.mark.parametrize('name', PRESETS)
+def test_a_dumped_preset_is_its_file(name, capsys):
+    assert run('config', 'dump', '--preset', name) == 0
+    text = (REPOSITORY / 'config' / f'{name}.yaml').read_text(encoding='utf-8')
     assert capsys.readouterr().out == text, GENERATE
-    words = ' '.join(re.sub(r'^\s*#', '', line).strip() for line in text.splitlines())
-    words = ' '.join(words.split())
-    assert preset.purpose in words
-    for name, (value, reason) in preset.overrides.items():
-        assert preset.config[name] == value
-        assert reason
-        assert f'Here: {reason} (default ' in words
 
 
 def test_the_paper_preset_has_none_of_our_departures():
@@ -165,43 +110,41 @@ def test_check_says_everything_that_is_wrong_at_once(tmp_path, capsys):
     ]
     for line, part in zip(lines, said, strict=True):
         assert line.startswith(f'{path}: ') and part in line
-    for text, problem in (
-        ('grid: {r_min: 20.0, r_max: 10.0}', 'grid.r_min = 20: must be below grid.r_max = 10'),
-        ('grid: [', 'not valid YAML'),
-        (None, 'No such file'),
-    ):
-        path.write_text(text) if text else path.unlink()
-        (found,) = Config.problems_of_file(path)
-        assert problem in found
+    path.write_text('grid: {r_min: 20.0, r_max: 10.0}')
+    (found,) = Config.problems_of_file(path)
+    assert 'grid.r_min = 20: must be below grid.r_max = 10' in found
+    path.unlink()
+    (found,) = Config.problems_of_file(path)
+    assert 'No such file' in found
 
 
 FOR_COMMANDS = 'good for --config, but not for the node, which needs the form of ROS: '
 
 
 @pytest.mark.parametrize(
-    ('text', 'use', 'given'),
+    ('text', 'use', 'n_given', 'differ'),
     [
-        ('label: {ground_tolerance: 0.15}\nsensor: {height: 2}', FOR_COMMANDS, '2, 2 differ'),
-        ('/**: {ros__parameters: {grid: {n_bins: 90}}}', 'good; ', '1, 1 differs'),
-        ('ground_segmentation_node: {ros__parameters: {}}', 'good; ', '0, 0 differ'),
-        ('/other: {ros__parameters: {}}', 'good for a node named /other only; ', '0, 0 differ'),
-        ('# nothing', FOR_COMMANDS, '0, 0 differ'),
+        ('label: {ground_tolerance: 0.15}\nsensor: {height: 2}', FOR_COMMANDS, 2, '2 differ'),
+        ('/**: {ros__parameters: {grid: {n_bins: 90}}}', 'good; ', 1, '1 differs'),
+        ('/other: {ros__parameters: {}}', 'good for a node named /other only; ', 0, '0 differ'),
+        ('# nothing', FOR_COMMANDS, 0, '0 differ'),
     ],
 )
-def test_check_says_who_reads_a_file_and_how_much_it_gives(text, use, given, tmp_path, capsys):
+def test_check_says_who_reads_a_file_and_how_much_it_gives(
+    text, use, n_given, differ, tmp_path, capsys
+):
     path = tmp_path / 'robot.yaml'
     path.write_text(text)
     assert run('config', 'check', path) == 0
     out, err = capsys.readouterr()
-    n_given, differ = given.split(', ')
     assert out.startswith(f'{path}: {use}')
     assert f'; {n_given} of {len(parameter_specs())} parameters given, {differ} from' in out
     note = f'gp-ground-seg: note: {path}: no parameters of the segmentation in it\n'
-    assert err == note * (n_given == '0')
+    assert err == note * (n_given == 0)
     is_taken = run('config', 'dump', '--config', path) == 0
     err = capsys.readouterr().err
     assert is_taken == ('other' not in use)
-    assert err == note * (n_given == '0') if is_taken else 'parameters of node /other; must' in err
+    assert err == note * (n_given == 0) if is_taken else 'parameters of node /other; must' in err
 
 
 def test_file_goes_over_preset_and_setting_over_file(tmp_path, capsys):
@@ -213,9 +156,8 @@ def test_file_goes_over_preset_and_setting_over_file(tmp_path, capsys):
     path.write_text(text)
     expected = PRESETS['paper'].config.replace(**{'grid.n_bins': 77, 'grid.n_segments': 55})
     assert Config.from_yaml(path) == expected
+    # The reasons of the preset are given for its own values only.
     assert 'Here: one zeta_g for all' in text
-    # That is why the preset has 120 bins; these are others.
-    assert 'Here: N in section IV' not in text
-    assert 'Preset paper' not in text
+    assert 'Here: N in section IV' not in text and 'Preset paper' not in text
     assert run('segment', 'x.bin', '--preset', 'velodyne') == 2
     assert run('config', 'dump', '--set', 'sensor.hight=2.5') == 2

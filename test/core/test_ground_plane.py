@@ -8,7 +8,6 @@ from conftest import fewer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gp_ground_seg import Config
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled import ground_plane as compiled
 from gp_ground_seg.core.compiled.backend import NumbaBackend
@@ -21,27 +20,9 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     RING_EDGES,
     solve_plane,
 )
-from gp_ground_seg.core.pipeline.points import rotation
 
 BACKENDS = NumpyBackend(), NumbaBackend()
 ORIGIN = (0.0, 0.0, 0.0)
-
-
-def cluttered_plane(seed, height, roll, pitch):
-    """Rings on a plane, a third of the directions blocked by obstacles, some noise."""
-    rng = np.random.default_rng(seed)
-    depression = np.radians(np.arange(2.0, 26.0, 1.0))
-    azimuth = np.linspace(-np.pi, np.pi, 360, endpoint=False)
-    r = (height / np.tan(depression))[:, None] * np.ones(len(azimuth))
-    z = np.full(r.shape, -height)
-    obstacle = np.repeat(rng.uniform(2.0, 30.0, 36), 10)
-    blocked = (r > obstacle) & np.repeat(rng.random(36) < 0.33, 10)
-    z = np.where(blocked, -height * obstacle / r, z)
-    r = np.where(blocked, obstacle, r)
-    points = np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], axis=-1).reshape(-1, 3)
-    mirrored = rng.random(len(points)) < 0.01
-    points[mirrored] *= rng.uniform(1.0, 2.0, (int(mirrored.sum()), 1))
-    return points @ rotation(roll, pitch) + rng.normal(0.0, 0.01, points.shape)
 
 
 def random_candidates(seed, n_segments, n_bins, share):
@@ -188,12 +169,3 @@ def test_moments_that_determine_no_plane_or_no_slope():
     x, y = 2.0, 3.0
     one = 1.0, x, y, x * x, x * y, y * y, -1.0, -x, -y
     assert solve_plane(one, before) == pytest.approx((1.0 + 0.1 * x - 0.2 * y, 0.1, -0.2))
-
-
-def test_a_refinement_that_leaves_the_ground_is_not_used(monkeypatch):
-    candidates = BACKENDS[0].build_grid(cluttered_plane(0, 1.5, 0.0, 0.0), Config()).candidates
-    monkeypatch.setattr(ground_plane, 'refined', lambda *_: (99.0, 0.0, 0.0))
-    assert ground_plane.fit_plane(candidates, 0.5, ORIGIN).height == pytest.approx(1.5, abs=0.1)
-    # Nor is a plane that no point lies on.
-    monkeypatch.setattr(ground_plane, 'refined', lambda *_: (19.0, 0.0, 0.0))
-    assert ground_plane.fit_plane(candidates, 0.5, ORIGIN) is None

@@ -14,23 +14,24 @@ LEFT_OUT = [0, 1, 70]
 FLOOR = {'00': 98.5, '01': 98.9, '03': 94.4, '05': 95.1, '08': 97.1, '10': 97.7}
 
 
-def test_iou_on_labelled_frames(kitti):
-    """GroundGrid convention, counted here, with no code of lab/scoring."""
+def classes_and_results(folder):
+    """Sequence, classes of the points, and result of each frame."""
     segmenter = GroundSegmenter()
-    counts = {}
-    for sequence in list_sequences(kitti):
-        total = np.zeros(3)
-        for frame in list_frames(kitti, sequence):
+    for sequence in list_sequences(folder):
+        for frame in list_frames(folder, sequence):
             points = read_points(frame.points_path)
             classes = read_labels(frame.labels_path, len(points))
-            truth, kept = np.isin(classes, GROUND_CLASSES), ~np.isin(classes, LEFT_OUT)
-            said = segmenter.segment(points).label == Label.GROUND
-            total += [
-                (said & truth & kept).sum(),
-                (said & ~truth & kept).sum(),
-                (~said & truth & kept).sum(),
-            ]
-        counts[sequence] = total
+            yield sequence, classes, segmenter.segment(points)
+
+
+def test_iou_on_labelled_frames(kitti):
+    """GroundGrid convention, counted here, with no code of lab/scoring."""
+    counts = {}
+    for sequence, classes, found in classes_and_results(kitti):
+        truth, kept = np.isin(classes, GROUND_CLASSES), ~np.isin(classes, LEFT_OUT)
+        said = found.label == Label.GROUND
+        one = [(a & b & kept).sum() for a, b in ((said, truth), (said, ~truth), (~said, truth))]
+        counts[sequence] = counts.get(sequence, np.zeros(3)) + one
     iou = {name: 100 * total[0] / total.sum() for name, total in counts.items()}
     pooled = sum(counts.values())
     assert 100 * pooled[0] / pooled.sum() >= 97.5
@@ -57,17 +58,12 @@ def test_no_person_is_lost_and_near_vehicles_are_obstacles(kitti):
 
 def test_ground_lies_where_it_is_said_to(kitti):
     """Heights of labelled ground returns about `ground_z`, as uncertain as `return_std` says."""
-    segmenter = GroundSegmenter()
     ratios, errors, before = {}, [], []
-    for sequence in list_sequences(kitti):
-        for frame in list_frames(kitti, sequence):
-            points = read_points(frame.points_path)
-            found = segmenter.segment(points)
-            own = np.isin(read_labels(frame.labels_path, len(points)), GROUND_CLASSES)
-            own &= np.isfinite(found.height)
-            errors.append(found.height[own])
-            before.append(found.labelled.height[own])
-            ratios.setdefault(sequence, []).append(np.abs(errors[-1]) / found.return_std[own])
+    for sequence, classes, found in classes_and_results(kitti):
+        own = np.isin(classes, GROUND_CLASSES) & np.isfinite(found.height)
+        errors.append(found.height[own])
+        before.append(found.labelled.height[own])
+        ratios.setdefault(sequence, []).append(np.abs(errors[-1]) / found.return_std[own])
     by_sequence = {name: np.concatenate(one) for name, one in ratios.items()}
     pooled = np.concatenate([*by_sequence.values()])
     assert 0.62 <= np.mean(pooled <= 1.0) <= 0.76

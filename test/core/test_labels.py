@@ -24,46 +24,6 @@ CONFIG = Config().replace(
 KNOTS = np.array([2.0, 4.0, 6.0, 8.0, 10.0])
 KNOTS.setflags(write=False)
 LEVEL = Relief.level()
-G, O, U = Label.GROUND, Label.OBSTACLE, Label.UNKNOWN  # noqa: E741
-
-
-def surface_of(heights=(0.0,) * 5):
-    mean = np.tile(np.asarray(heights, dtype=float), (4, 1))
-    return GroundSurface(KNOTS, mean, np.full((4, 5), 0.1), np.ones(0, dtype=bool))
-
-
-def label(backend, ranges, z, surface=None, faces=None, angle=0.1, sigma_n=0.05, **changes):
-    """Labels and cells of points in one direction.
-
-    `faces` names points whose tile is a face, and whether its base is occluded.
-    """
-    named = {f'label.{name}': value for name, value in changes.items()}
-    config = CONFIG.replace(**{'observation.sigma_n': sigma_n, **named})
-    r, z = np.broadcast_arrays(np.asarray(ranges, dtype=float), np.asarray(z, dtype=float))
-    scan = backend.build_grid(np.column_stack([r * np.cos(angle), r * np.sin(angle), z]), config)
-    marks = Faces.none(scan.tiles)
-    for i, occluded in (faces or {}).items():
-        marks.is_face[scan.tiles.tile[i]] = True
-        marks.has_occluded_base[scan.tiles.tile[i]] = occluded
-    found = backend.label_points(scan, marks, surface or surface_of(), LEVEL, config)
-    assert found.label.dtype == np.uint8
-    ground = np.nan_to_num(found.margin, nan=-1.0) >= 0.0
-    np.testing.assert_array_equal(found.label == Label.GROUND, ground)
-    return found, scan.grid
-
-
-@pytest.mark.parametrize(
-    ('rule', 'expected'), [('tolerance', [G, G, O, G, O, U]), ('roughness', [G, G, O, G, G, U])]
-)
-def test_labels_by_height(backend, rule, expected):
-    # On a surface as smooth as this the returns about a cell say less than the tolerance.
-    heights = [0.0, 0.09, 0.14, -0.09, -0.11, np.nan, *[0.0] * 2000]
-    found, _ = label(backend, 3.0, heights, rule=rule, sigma_n=0.001)
-    assert list(found.label[:6]) == expected
-    np.testing.assert_allclose(found.margin[:3], [0.1, 0.01, -0.04], atol=2e-5)
-    below = {'tolerance': 0.1 - 0.11, 'roughness': 0.1 + 0.11}[rule]
-    np.testing.assert_allclose(found.margin[4], below, atol=1e-12)
-    assert np.isnan(found.margin[5])
 
 
 def ground_about(side, std, rng):
@@ -72,14 +32,13 @@ def ground_about(side, std, rng):
     return np.column_stack([x.ravel(), y.ravel(), np.abs(rng.normal(0.0, std, x.size))])
 
 
-def labels_of(backend, points, r_max=12.0, **changes):
+def labels_of(backend, points):
     """Labels and margins of points (N, 3) over a level surface."""
-    config = CONFIG.replace(**{'grid.r_max': r_max, 'grid.r_min': 0.1 * r_max, **changes})
-    knots = np.linspace(0.1 * r_max, r_max, 5)
-    surface = surface_of()._replace(knots=knots)
+    config = CONFIG.replace(**{'grid.r_max': 12.0, 'grid.r_min': 1.2})
+    mean, std = np.zeros((4, 5)), np.full((4, 5), 0.1)
+    surface = GroundSurface(np.linspace(1.2, 12.0, 5), mean, std, np.ones(0, dtype=bool))
     scan = backend.build_grid(points, config)
-    faces = Faces.none(scan.tiles)
-    return backend.label_points(scan, faces, surface, LEVEL, config)
+    return backend.label_points(scan, Faces.none(scan.tiles), surface, LEVEL, config)
 
 
 @pytest.mark.parametrize('std', [0.0, 0.03])
@@ -102,14 +61,6 @@ def test_ground_as_rough_as_that_everywhere_is_ground(backend):
     assert (found.label == Label.GROUND).all()
     band = (found.margin + found.height)[found.height < 0.02]
     np.testing.assert_allclose(band, 2.1 * 0.3 / np.sqrt(3.0), rtol=0.15)
-
-
-def test_of_a_face_only_the_base_is_ground_and_nothing_where_it_is_occluded(backend):
-    # The surface climbs a step, and its riser lies on it.
-    ranges, riser = [5.0, 5.001, 5.002], np.array([0.0, 0.04, 0.14])
-    surface = surface_of([0.1] * 5)
-    for faces, expected in ((None, [G, G, G]), ({0: False}, [G, G, O]), ({0: True}, [O, O, O])):
-        assert list(label(backend, ranges, riser, surface, faces)[0].label) == expected
 
 
 def test_probability_is_a_half_at_the_edge_and_follows_the_certainty():

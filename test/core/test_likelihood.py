@@ -2,12 +2,10 @@
 
 import functools
 import math
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import reference_gp
-from conftest import compiled_log_likelihood
 
 from gp_ground_seg.core.frame import Inliers
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
@@ -80,21 +78,6 @@ def test_value_and_gradient_are_those_of_the_reference(likelihood, name, latent_
     assert bars != 'none' or not gradient[2:].any()
 
 
-def test_the_printed_objective_has_no_upper_bound_and_ours_does_not_move(likelihood):
-    """Scaling the latent process changes no prediction, yet the printed objective grows."""
-    inliers = random_inliers(6)
-    printed, ours = (
-        [
-            likelihood(scaled(1, 1, shrink, 1, shrink), inliers, 0.05, terms)[0]
-            for shrink in (1.0, 1e-1, 1e-2, 1e-3)
-        ]
-        for terms in (True, False)
-    )
-    n_bar = np.diff(inliers.bar_offsets)[np.diff(inliers.offsets) > 0].sum()
-    np.testing.assert_allclose(np.diff(printed), n_bar * np.log(10.0), rtol=1e-6)
-    np.testing.assert_allclose(ours, ours[0], rtol=1e-6)
-
-
 NOISELESS, NOISELESS_LATENT = TYPICAL.copy(), TYPICAL.copy()
 NOISELESS[:2], NOISELESS_LATENT[4] = np.log([1e8, 1e-9]), -400.0
 
@@ -119,50 +102,3 @@ def test_beyond_the_bound_of_length_scales_nothing_depends_on_the_latent_process
     beyond = TYPICAL.copy()
     beyond[5:] = MAX_ABS_LOG_LENGTH_SCALE + 10.0
     assert not likelihood(beyond, inliers, 0.05, False)[1][2:].any()
-
-
-def test_results_do_not_depend_on_where_the_arrays_lie():
-    """The arrays of a small segment lie side by side."""
-    pytest.importorskip('numba')
-    rng = np.random.default_rng(9)
-    thread = ThreadPoolExecutor(1)
-    for _ in range(100):
-        n, n_bar = rng.integers(2, 9), rng.integers(8, 13)
-        in_one, bars_in_one = np.zeros((2, 7), dtype=np.int64)
-        place = rng.integers(1, 7)
-        in_one[place:], bars_in_one[place:] = n, n_bar
-        r, r_bar = (np.sort(rng.uniform(3, 20, size)) for size in (n, n_bar))
-        z, log_extent = rng.normal(0, 0.5, n), rng.choice([0.0, 0.5, 1.2], n_bar)
-        kind = rng.integers(0, 9, n_bar)
-        inliers = Inliers(in_one, r, z, np.zeros(n), bars_in_one, r_bar, log_extent, kind)
-        # Here, and in a thread, which has memory of its own.
-        arguments = TYPICAL, inliers, 0.05, False
-        value, gradient = compiled_log_likelihood(*arguments)
-        other, also = thread.submit(compiled_log_likelihood, *arguments).result()
-        assert (value, gradient.tobytes()) == (other, also.tobytes())
-
-
-def test_with_one_length_scale_it_is_scikit_learns_regression(likelihood):
-    """Log marginal likelihood of the stationary case, by another's code; its posterior is that
-    of the joint Gaussian in test_ground.py."""
-    gaussian_process = pytest.importorskip('sklearn.gaussian_process')
-    kernels = gaussian_process.kernels
-    rng = np.random.default_rng(4)
-    r = np.sort(rng.uniform(2, 40, 25))
-    z = 0.2 * np.sin(0.3 * r) + rng.normal(0, 0.05, 25)
-    sigma_f, sigma_n, length = 0.4, 0.05, 3.0
-    kernel = kernels.ConstantKernel(sigma_f**2) * kernels.RBF(length)
-    theirs = gaussian_process.GaussianProcessRegressor(kernel, alpha=sigma_n**2, optimizer=None)
-    theirs.fit(r[:, None], z)
-    # One segment, its latent process constant.
-    theta = np.log([sigma_f, sigma_n, 0.9, 2.0, 0.3, length])
-    bars = np.array([0, 3]), np.array([5.0, 15.0, 30.0]), np.zeros(3), np.zeros(3, np.int64)
-    inliers = Inliers(np.array([0, 25]), r, z, np.zeros(25), *bars)
-    value, gradient = likelihood(theta, inliers, 0.0, False)
-    their_value, their_gradient = theirs.log_marginal_likelihood(
-        theirs.kernel_.theta, eval_gradient=True
-    )
-    assert value == pytest.approx(their_value, rel=1e-12)
-    # Theirs is in log sigma_f^2 and log length-scale.
-    assert gradient[0] == pytest.approx(2.0 * their_gradient[0], rel=1e-9)
-    assert gradient[5] == pytest.approx(their_gradient[1], rel=1e-9)

@@ -20,8 +20,8 @@ from gp_ground_seg.core.pipeline.mirror_images import (
 )
 from gp_ground_seg.lab.simulation import SENSORS
 
-WET = [('hdl-64e', 0), ('vlp-16', 1), ('os1-128', 2)]
-DRY = ['flat', 'ramp', 'rough', 'ditch', 'dike', 'hills', 'bank', 'urban', 'car_park', 'low_boxes']
+WET = [('hdl-64e', 0), ('vlp-16', 1)]
+DRY = ['ramp', 'rough', 'ditch', 'dike', 'hills', 'urban', 'car_park', 'low_boxes']
 
 
 def images_in(points, sensor):
@@ -36,40 +36,30 @@ def images_in(points, sensor):
 
 
 @pytest.mark.parametrize(('sensor', 'seed'), WET)
-def test_images_are_found_and_raised_to_what_they_are_images_of(sensor, seed):
+def test_images_are_found_and_raised_and_the_wet_road_is_ground(backend, sensor, seed):
     scan = simulated('wet_road', sensor, seed)
-    height = scan.points[:, 2] - scan.ground_z
-    is_image, found = images_in(scan.points, Config().sensor)
-    is_deep = ~scan.is_ground & (height < -DEEP - 0.1)
+    points, truth = scan.points, scan.is_ground
+    height = points[:, 2] - scan.ground_z
+    is_image, found = images_in(points, Config().sensor)
+    is_deep = ~truth & (height < -DEEP - 0.1)
     assert is_deep.sum() > 300
     assert is_image[is_deep].mean() > 0.98
-    assert not is_image[scan.is_ground | (height > 0.0)].any()
-    raised = found.raised(scan.points[:, :3]) - scan.points[:, :3]
+    assert not is_image[truth | (height > 0.0)].any()
+    raised = found.raised(points[:, :3]) - points[:, :3]
     np.testing.assert_array_equal(np.flatnonzero(raised.any(axis=1)), found.points)
     # The plane is up to 0.17 m off where images are told, and so twice that what is raised.
     mirrored = height[found.points] + found.rise
     np.testing.assert_allclose(mirrored, -height[found.points], atol=0.35)
-
-
-@pytest.mark.parametrize(('sensor', 'seed'), WET)
-def test_a_wet_road_is_ground_and_its_images_are_not(backend, sensor, seed):
-    scan = simulated('wet_road', sensor, seed)
-    result = GroundSegmenter(backend=backend).segment(scan.points)
-    is_ground, truth = result.label == Label.GROUND, scan.is_ground
+    result = GroundSegmenter(backend=backend).segment(points)
+    is_ground = result.label == Label.GROUND
     assert (is_ground & truth).sum() / (is_ground | truth).sum() > 0.93
-    below = ~truth & (scan.points[:, 2] - scan.ground_z < -0.3)
+    below = ~truth & (height < -0.3)
     assert is_ground[below].mean() < 0.01
     # The ground at an image is above it.
     missed = (result.ground_z - scan.ground_z)[below]
     assert np.nanmedian(np.abs(missed)) < 0.01
-
-
-@pytest.mark.parametrize(('sensor', 'seed'), WET)
-def test_an_image_is_no_candidate(backend, sensor, seed):
-    """Raised to the underside of a car it would be ground that climbs to the roofs behind."""
-    points = simulated('wet_road', sensor, seed).points
-    found = images_in(points, Config().sensor)[1]
-    candidates = GroundSegmenter(backend=backend).segment(points).frame.candidates
+    # Raised to the underside of a car, an image would be ground that climbs to the roofs behind.
+    candidates = result.frame.candidates
     at_images = {tuple(place) for place in points[found.points, :2].astype(np.float64).tolist()}
     assert at_images.isdisjoint(zip(candidates.x.tolist(), candidates.y.tolist(), strict=True))
 
@@ -107,13 +97,13 @@ def test_backends_agree_on_which_road_is_wet():
     assert 30 < sum(found) < 270
 
 
-def hall(height, steepest, seed, *, is_polished=False, has_tables=False):
+def hall(height, steepest, *, is_polished=False, has_tables=False):
     """Scan by 64 beams in a hall of 16 by 12 m, and which of its returns are of the floor.
 
     A polished floor mirrors a third of the rays. Tables stand in rows, 0.72 m high, with 0.6 and
     0.7 m between them.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     elevation, azimuth = np.meshgrid(
         np.linspace(-steepest, steepest, 64), np.linspace(-np.pi, np.pi, 1024, endpoint=False)
     )
@@ -139,26 +129,24 @@ def hall(height, steepest, seed, *, is_polished=False, has_tables=False):
     return points.T.astype(np.float32), is_floor
 
 
-@pytest.mark.parametrize(('height', 'steepest'), [(0.45, 0.78), (0.8, 0.6)])
-def test_the_floor_of_a_polished_hall_is_the_ground(backend, height, steepest):
-    points, is_floor = hall(height, steepest, 0, is_polished=True)
+def test_the_floor_of_a_polished_hall_is_the_ground(backend):
+    points, is_floor = hall(0.45, 0.78, is_polished=True)
     wrong = [np.nan, np.inf, -np.inf, 1e38]
     points[::100] = np.resize(wrong, len(points[::100]))[:, None]
     is_floor[::100] = False
     result = GroundSegmenter(backend=backend).segment(points)
-    assert result.pose.height == pytest.approx(height, abs=0.03)
+    assert result.pose.height == pytest.approx(0.45, abs=0.03)
     assert (result.is_ground & is_floor).sum() / (result.is_ground | is_floor).sum() > 0.9
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_a_polished_floor_is_a_mirror_and_tables_are_not(seed):
+def test_a_polished_floor_is_a_mirror_and_tables_are_not():
     origin = (0.0, 0.0, 0.0)
     for height, steepest, plane_z, kind in (
         (0.45, 0.78, -0.45, {'is_polished': True}),
         (0.45, 0.78, -0.45, {}),
         (1.2, 0.3, -0.48, {'has_tables': True}),
     ):
-        scan = NumpyBackend().build_grid(hall(height, steepest, seed, **kind)[0], Config())
+        scan = NumpyBackend().build_grid(hall(height, steepest, **kind)[0], Config())
         plane = fit_plane(in_sight(scan.candidates, 0.0), 1.0, origin)
         assert -plane.height == pytest.approx(plane_z, abs=0.03)
         assert is_mirror(plane, scan, origin) == ('is_polished' in kind)

@@ -29,11 +29,6 @@ def correct(cells, residuals, surface, noise=0.02, slope_std=0.05, find=correct_
     return find(surface, labelled, grid, noise, slope_std)
 
 
-def flat(std=0.03, z=-1.7):
-    shape = N_SEGMENTS, len(KNOTS)
-    return GroundSurface(KNOTS, np.full(shape, z), np.full(shape, std), np.ones(0, bool))
-
-
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60))
 def test_the_correction_is_the_reference(seed, n_returns):
     rng = np.random.default_rng(seed)
@@ -55,48 +50,6 @@ def test_the_correction_is_the_reference(seed, n_returns):
     np.testing.assert_allclose(np.where(is_one, one, other), values, rtol=0, atol=1e-7)
     np.testing.assert_allclose(found.mean, mean + found.correction, atol=1e-12)
     assert (found.return_std >= found.std)[np.isfinite(mean)].all()
-
-
-NOISES = [(0.05, 0.0), (0.05, 0.03), (0.03, 0.06), (0.0, 0.05)]
-
-
-@pytest.mark.parametrize(('ground', 'noise'), NOISES)
-@pytest.mark.parametrize('numbers', [[4, 4, 4], [5, 5, 5, 5, 5, 5], [20, 4, 3, 2, 1]])
-def test_variance_is_that_of_the_ground_and_of_its_mean(ground, noise, numbers):
-    """Cells of random ground, each with its own number of noisy returns, many times."""
-    rng, found = np.random.default_rng(0), []
-    cells = np.repeat([0, 1, 5, 6, 30, 31][: len(numbers)], numbers)
-    for _ in range(300):
-        heights = np.repeat(rng.normal(0.0, ground, len(numbers)), numbers)
-        residuals = heights + rng.normal(0.0, noise, len(cells))
-        found.append(correct(cells, residuals, flat()).std[0, 1] ** 2)
-    expected = ground**2 + noise**2 / len(cells)
-    # Noise is estimated too low from few returns in a cell, and the first guess holds it.
-    assert 0.9 * expected <= np.mean(found) <= 1.15 * expected + 0.2 * noise**2
-
-
-@pytest.mark.parametrize('slope_std', [0.0, 0.05, 0.2])
-def test_away_from_evidence_the_ground_is_uncertain_by_the_distance(slope_std):
-    found = correct([0, 0, 1, 1], [0.0, 0.02, 0.0, 0.02], flat(), slope_std=slope_std)
-    distance = KNOTS[3:] - KNOTS[2]
-    expected = np.sqrt(0.03**2 + (slope_std * distance) ** 2)
-    np.testing.assert_allclose(found.std[0, 3:], expected, rtol=1e-6)
-    np.testing.assert_allclose(found.correction, 0.01, atol=1e-6)
-    # The same to both sides.
-    np.testing.assert_allclose(found.std[1:], found.std[:0:-1], rtol=1e-6)
-
-
-def test_two_estimates_of_unseen_ground_that_differ_make_it_uncertain():
-    """The process sees a car's roof, 0.5 m up, beside ground that is seen."""
-    surface = flat(std=0.05)
-    surface.mean[0, 3:] += 0.5
-    plain = correct([0, 0, 1, 1], [0.0, 0.0, 0.0, 0.0], flat(std=0.05))
-    found = correct([0, 0, 1, 1], [0.0, 0.0, 0.0, 0.0], surface)
-    assert (found.mean[0, 3:] > -1.7 + 0.05).all()
-    assert (found.mean[0, 3:] < -1.7 + 0.49).all()
-    assert (found.std[0, 3:] > plain.std[0, 3:] + [0.1, 0.03, 0.005]).all()
-    inside = np.abs(found.mean[0, 3:] + 1.7) / found.std[0, 3:]
-    assert (inside < 2.5).all()
 
 
 def test_nothing_is_computed_before_it_is_asked_for(monkeypatch):
@@ -131,7 +84,10 @@ def test_height_and_ground_z_are_of_one_surface(tilt):
 
 @pytest.mark.parametrize(
     'sensor',
-    ['hdl-64e', pytest.param('hdl-32e', marks=pytest.mark.slow), 'vlp-16', 'os1-128', 'mid-360'],
+    [
+        *('hdl-64e', 'vlp-16', 'mid-360'),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ('hdl-32e', 'os1-128')),
+    ],
 )
 def test_the_defaults_fit_every_sensor_and_errors_are_as_large_as_said(sensor):
     """Every scene once, by exact labels and heights; docs/accuracy.md has more seeds."""

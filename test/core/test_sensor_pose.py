@@ -9,7 +9,6 @@ from conftest import fewer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rooms import HALL, ROOM, SMALL_ROOM, room
-from test_ground_plane import cluttered_plane
 
 from gp_ground_seg import Config, GroundSegmenter, PointCloudError
 from gp_ground_seg.core.backend import NumpyBackend
@@ -57,6 +56,23 @@ def scan_of(scene, sensor, height, seed=0, roll=0.0, pitch=0.0):
     mounted = dataclasses.replace(sensor, height=height, roll=roll, pitch=pitch)
     made = SCENES[scene](seed) if isinstance(scene, str) else scene
     return simulate_scan(made, mounted, np.random.default_rng(seed))
+
+
+def cluttered_plane(seed, height, roll, pitch):
+    """Rings on a plane, a third of the directions blocked by obstacles, some noise."""
+    rng = np.random.default_rng(seed)
+    depression = np.radians(np.arange(2.0, 26.0, 1.0))
+    azimuth = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+    r = (height / np.tan(depression))[:, None] * np.ones(len(azimuth))
+    z = np.full(r.shape, -height)
+    obstacle = np.repeat(rng.uniform(2.0, 30.0, 36), 10)
+    blocked = (r > obstacle) & np.repeat(rng.random(36) < 0.33, 10)
+    z = np.where(blocked, -height * obstacle / r, z)
+    r = np.where(blocked, obstacle, r)
+    points = np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], axis=-1).reshape(-1, 3)
+    mirrored = rng.random(len(points)) < 0.01
+    points[mirrored] *= rng.uniform(1.0, 2.0, (int(mirrored.sum()), 1))
+    return points @ rotation(roll, pitch) + rng.normal(0.0, 0.01, points.shape)
 
 
 @given(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5))
@@ -125,15 +141,16 @@ def moved(points, lift):
     return points[:, :3].astype(np.float64) + np.array([0.0, 0.0, lift])
 
 
-@pytest.mark.parametrize('sensor', [SMALL_HDL, SMALL_VLP], ids=lambda s: s.name)
-@pytest.mark.parametrize('scene', ['flat', 'kerb', 'urban', 'rough'])
+@pytest.mark.parametrize(
+    ('scene', 'sensor'), [('kerb', SMALL_HDL), ('rough', SMALL_HDL), ('urban', SMALL_VLP)]
+)
 @pytest.mark.parametrize('height', [0.4, 1.73])
-def test_the_origin_may_be_at_any_height(sensor, scene, height):
+def test_the_origin_may_be_at_any_height(scene, sensor, height):
     """In the frame of a vehicle z is 0 on the ground, and labels are those of the sensor's own."""
     points = scan_of(scene, sensor, height).points
     own = SEGMENTER.segment(points)
     assert own.pose.height_estimated and own.warnings == ()
-    for lift in (height, height - 0.1, height + 0.33, height + 3.0, height - 15.0):
+    for lift in (height, height + 0.33, height - 15.0):
         # What is as high as a low sensor is no seed: its place must be known.
         origin = (0.0, 0.0, lift if height < 1.0 else 0.0)
         found = SEGMENTER.segment(moved(points, lift), origin=origin)
@@ -141,36 +158,32 @@ def test_the_origin_may_be_at_any_height(sensor, scene, height):
         assert found.pose.height == pytest.approx(own.pose.height - lift, abs=1e-4)
         assert (found.label != own.label).mean() < 0.002
         np.testing.assert_allclose(found.height, own.height, atol=0.01)
+        # It can be given, also if it is 0 or below.
+        given_height = round(found.pose.height, 2)
+        told = pose_of(moved(points, lift), height=given_height)
+        assert told.height == given_height and told.contradictions == () == told.warnings
 
 
-@pytest.mark.parametrize('height', [0.0, -0.3])
-def test_a_height_of_zero_or_below_can_be_given(height):
-    points = moved(scan_of('urban', SMALL_HDL, 1.73).points, 1.73 - height)
-    own, told = SEGMENTER.segment(points), segmenter(height=height).segment(points)
-    assert told.pose.height == height and told.pose.contradictions == () == told.warnings
-    assert (told.label != own.label).mean() < 0.002
-    wrong = segmenter(height=height - 0.5).segment(points)
-    (line,) = wrong.pose.contradictions
-    assert "above the cloud's origin" in line or "below the cloud's origin" in line
+def with_beams(sensor, *elevations):
+    return dataclasses.replace(sensor, elevations=tuple(np.radians(elevations)))
 
 
 @pytest.mark.parametrize('lift', [0.0, 0.3])
-@pytest.mark.parametrize('scene', ['urban', ROOM], ids=['urban', 'room'])
-def test_a_scan_of_one_beam_shows_no_ground(scene, lift):
-    laser = dataclasses.replace(VLP_16, elevations=(0.0,))
-    pose = pose_of(moved(scan_of(scene, laser, 0.3).points, lift))
+@pytest.mark.parametrize(
+    ('scene', 'sensor', 'height'),
+    [
+        ('urban', with_beams(VLP_16, 0.0), 0.3),
+        (ROOM, with_beams(VLP_16, 0.0), 0.3),
+        # This sensor sees the ceiling well, and the floor hardly.
+        (ROOM, with_beams(SMALL_HDL, *np.linspace(52.0, -7.0, 60)), 1.8),
+    ],
+    ids=['street, one beam', 'room, one beam', 'ceiling'],
+)
+def test_a_scan_that_shows_no_ground(scene, sensor, height, lift):
+    pose = pose_of(moved(scan_of(scene, sensor, height).points, lift * height / 0.3))
     assert not pose.height_estimated
     assert 'sensor.height' in pose.warnings[0]
-
-
-@pytest.mark.parametrize('lift', [0.0, 1.8])
-def test_a_ceiling_is_no_ground(lift):
-    """Of this room the sensor sees the ceiling well and the floor hardly."""
-    wide = dataclasses.replace(
-        SMALL_HDL, elevations=tuple(np.radians(np.linspace(52.0, -7.0, 60)))
-    )
-    pose = pose_of(moved(scan_of(ROOM, wide, 1.8).points, lift))
-    assert not pose.height_estimated and pose.measured is None
+    assert scene == 'urban' or pose.measured is None
 
 
 def test_where_the_rays_start_tells_a_floor_from_a_cone_on_the_walls():
@@ -190,8 +203,7 @@ def test_where_the_rays_start_tells_a_floor_from_a_cone_on_the_walls():
     assert not pose_of(walls, origin_z=1.0).height_estimated
 
 
-@pytest.mark.parametrize('degrees', [35, 40, 45])
-@pytest.mark.parametrize('sensor', [SMALL_HDL, SMALL_VLP], ids=lambda s: s.name)
+@pytest.mark.parametrize(('sensor', 'degrees'), [(SMALL_HDL, 45), (SMALL_VLP, 35)])
 def test_a_large_tilt_is_levelled(sensor, degrees):
     """Beyond what is searched below z: in a frame of its own the ground is found all the same."""
     for direction in (0.0, 0.8, 2.5):
@@ -218,17 +230,6 @@ def test_a_tilt_beyond_46_degrees_is_refused_with_its_angles(degrees, start):
     assert contradiction == line
 
 
-def test_a_search_leaves_the_scan_as_it_was():
-    """What is steep is looked at again, levelled."""
-    lean = tilted(scan_of('urban', SMALL_OS1, 1.5).points, math.radians(35.0), 0.0)
-    fast, plain = (
-        segmenter(backend, roll=0.0, pitch=0.0).segment(lean)
-        for backend in (BACKEND, NumpyBackend())
-    )
-    assert fast.pose.contradictions and fast.pose.is_level
-    assert (fast.label != plain.label).mean() < 1e-4
-
-
 def test_a_room_too_small_to_see_the_floor_determines_nothing_and_that_is_said_once(caplog):
     """Walls cut by the lowest beam alone are no plane; the default is said to be one."""
     closet = room('closet', [(-1.5, -1.0), (1.5, -1.0), (1.5, 2.0), (-1.5, 2.0)])
@@ -247,47 +248,24 @@ def test_a_room_too_small_to_see_the_floor_determines_nothing_and_that_is_said_o
     assert [line.split(' of the scan')[0] for line in told.warnings] == ['next to nothing']
 
 
-THREE = np.array([[10.0, 0.0, -1.0], [0.0, 10.0, -1.0], [-10.0, 0.0, -1.0]])
-# Few enough for wrong returns.
-HUGE = np.where(np.arange(50)[:, None] % 12, np.nan, np.full(3, 1e200))
-FEW = THREE[:0], THREE * np.nan, THREE[:1], THREE, HUGE, -1e108 * HUGE
-
-
-@pytest.mark.filterwarnings('ignore:overflow')
-@pytest.mark.parametrize('points', FEW)
-@pytest.mark.parametrize('backend', [NumbaBackend(), NumpyBackend()], ids=lambda b: b.name)
-def test_too_few_points_to_determine_anything(points, backend):
-    pose = segmenter(backend).segment(points).pose
-    assert (pose.height, pose.roll, pose.pitch) == (DEFAULT_HEIGHT, 0.0, 0.0)
-    assert not (pose.height_estimated or pose.roll_estimated or pose.pitch_estimated)
-    assert segmenter(backend).segment(points).pose == pose
-    turned = segmenter(backend, roll=2.0, pitch=0.3).segment(points)
-    assert len(turned.label) == len(points)
-
-
 def test_what_is_given_is_used_and_contradicted():
     points = scan_of('flat', HDL_64E, 1.73).points
-    assert pose_of(points).contradictions == ()
-    wrong = segmenter(height=0.9).segment(points).pose
-    assert wrong.height == 0.9
-    assert not wrong.height_estimated
+    for height in ({}, {'height': 1.6}):
+        assert pose_of(points, **height).contradictions == ()
+    wrong = pose_of(points, height=0.9)
+    assert (wrong.height, wrong.height_estimated) == (0.9, False)
     assert wrong.measured.height == pytest.approx(1.73, abs=0.03)
     (line,) = wrong.contradictions
     assert 'sensor.height = 0.9' in line and '1.7' in line
-    assert pose_of(points, height=1.6).contradictions == ()
     rolled = pose_of(points, height=1.73, roll=0.3, pitch=0.0)
     assert (rolled.roll, rolled.pitch) == (0.3, 0.0)
     assert any('sensor.roll = 0.3' in line for line in rolled.contradictions)
     # Angles of one scan, as from tf, are given ones too.
     assert SEGMENTER.segment(points, tilt=(0.3, 0.0)).pose.roll == 0.3
-
-
-def test_angles_given_are_kept_and_the_other_is_found():
     points = scan_of('flat', HDL_64E, 1.73, roll=0.1, pitch=0.12).points
-    angles = {'roll': 0.1, 'pitch': 0.12}
     for known in ({}, {'roll': 0.1}, {'pitch': 0.12}):
         pose = pose_of(points, **known)
-        for name, value in angles.items():
+        for name, value in {'roll': 0.1, 'pitch': 0.12}.items():
             assert getattr(pose, f'{name}_estimated') == (name not in known)
             assert getattr(pose, name) == pytest.approx(value, abs=0.0 if name in known else 0.005)
         assert pose.height == pytest.approx(1.73, abs=0.03)
@@ -352,9 +330,10 @@ def refusal(points, start='z does not point up: '):
     return line, tuple(map(float, angles))
 
 
-@SENSORS
-@pytest.mark.parametrize('scene', ['flat', 'slope', 'rough', 'urban'])
-def test_z_not_up_is_refused_with_the_axis_that_is(sensor, scene):
+@pytest.mark.parametrize(
+    ('scene', 'sensor'), [('slope', SMALL_HDL), ('urban', SMALL_VLP), ('rough', SMALL_OS1)]
+)
+def test_z_not_up_is_refused_with_the_axis_that_is(scene, sensor):
     points = scan_of(scene, sensor, 1.5).points
     slope = 0.15 if scene == 'slope' else 0.05
     for up, turn in UPS.items():
