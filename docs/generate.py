@@ -37,9 +37,8 @@ def to_markdown_table() -> str:
     for spec in parameter_specs():
         if spec.basic:
             name, default = f'`{spec.name}`', f'`{yaml_scalar(spec.default)}`'
-            accepted = f'{spec.accepted_briefly} {spec.unit}'.rstrip()
             symbol = f' (`{spec.symbol}`)' if spec.symbol else ''
-            rows.append((name, default, accepted, f'{spec.description}{symbol}'))
+            rows.append((name, default, spec.accepted, f'{spec.description}{symbol}'))
     lines = ['| ' + ' | '.join(cell.replace('|', r'\|') for cell in row) + ' |' for row in rows]
     return '\n'.join(lines) + '\n'
 
@@ -102,8 +101,7 @@ def generated_files(readme: str) -> dict[str, str]:
     DataError as `with_table`.
     """
     files = {
-        f'config/{preset.name}.yaml': preset.config.to_yaml(preset.title, preset.reasons)
-        for preset in PRESETS.values()
+        f'config/{preset.name}.yaml': preset.to_yaml(preset.config) for preset in PRESETS.values()
     }
     files[README] = with_table(readme, SCORES, to_scores_table())
     files['docs/parameters.md'] = PAGE_HEAD + to_markdown_table() + ALL_PARAMETERS

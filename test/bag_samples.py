@@ -1,11 +1,13 @@
 """Small bags of every kind, for the tests."""
 
+from functools import partial
+
 import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
-from gp_ground_seg.data.bags import BagWriter, encode_cloud
+from gp_ground_seg.data.bags import BagWriter, encode_cloud, jazzy_types
 
 START = 1_317_000_000_123_456_789
 PERIOD = 100_000_000
@@ -27,7 +29,7 @@ def scan(seed=0, n_ground=1500, n_wall=300):
 def cloud(index=0, **changes):
     """Cloud with a ring and padding, organised in one row unless told otherwise."""
     points = scan(index, **changes)
-    new = get_typestore(Stores.ROS2_JAZZY).types
+    new = jazzy_types().types
     layout = (('x', 0, 7), ('y', 4, 7), ('z', 8, 7), ('i', 12, 7), ('ring', 17, 4))
     fields = [new['sensor_msgs/msg/PointField'](*field, 1) for field in layout]
     rng = np.random.default_rng(index)
@@ -42,10 +44,8 @@ def cloud(index=0, **changes):
 
 
 def string_message(text):
-    types = get_typestore(Stores.ROS2_JAZZY)
-    return bytes(
-        types.serialize_cdr(types.types['std_msgs/msg/String'](text), 'std_msgs/msg/String')
-    )
+    message = jazzy_types().types['std_msgs/msg/String'](text)
+    return bytes(jazzy_types().serialize_cdr(message, 'std_msgs/msg/String'))
 
 
 def write_ros2_bag(path, n_clouds=3, topics=('/points',), storage=None, silent=(), **changes):
@@ -69,27 +69,13 @@ def write_ros1_bag(path, n_clouds=3, topic='/kitti/velo/pointcloud'):
     """A bag as kitti2bag makes, with a message of a custom type, and a topic of two publishers."""
     types = get_typestore(Stores.ROS1_NOETIC)
     types.register(get_types_from_msg(CUSTOM_DEFINITION, CUSTOM))
-    new = types.types
-    time_type = new['builtin_interfaces/msg/Time']
     with Ros1Writer(path) as bag:
-
-        def connect(name, msgtype, **options):
-            connection = bag.add_connection(name, msgtype, typestore=types, **options)
-
-            def write(time, *body):
-                raw = types.serialize_ros1(new[msgtype](*body), msgtype)
-                bag.write(connection, time, raw)
-
-            return write
-
-        clouds, odd = connect(topic, POINT_CLOUD2), connect('/odd', CUSTOM)
-        texts = [connect('/text', 'std_msgs/msg/String', callerid=name) for name in ('/a', '/b')]
+        add = partial(bag.add_connection, typestore=types)
+        clouds, odd = add(topic, POINT_CLOUD2), add('/odd', CUSTOM)
+        texts = [add('/text', 'std_msgs/msg/String', callerid=name) for name in ('/a', '/b')]
         for k in range(n_clouds):
             time = START + k * PERIOD
-            header, *body = vars(cloud(k)).values()
-            stamp = time_type(header.stamp.sec, header.stamp.nanosec)
-            header = new['std_msgs/msg/Header'](k, stamp, header.frame_id)
-            clouds(time, header, *body)
-            odd(time + 1, header, time_type(k, 5), np.arange(k, dtype=np.uint8), k / 3)
-            for text in texts:
-                text(time + 2, f'{k}')
+            raw = jazzy_types().cdr_to_ros1(encode_cloud(cloud(k)), POINT_CLOUD2)
+            bag.write(clouds, time, raw)
+            for other in (odd, *texts):
+                bag.write(other, time + 1, b'not read')

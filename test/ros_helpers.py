@@ -273,11 +273,11 @@ class Link:
 
     node_name = f'{NAMESPACE}/{NODE_NAME}'
 
-    def __init__(self, context, sends=RELIABLE, takes=RELIABLE):
+    def __init__(self, context, sends=RELIABLE):
         self.probe = Node('probe', context=context, namespace=NAMESPACE)
         self.publisher = sends and self.probe.create_publisher(PointCloud2, 'points', sends)
-        self.ground = Collector(self.probe, PointCloud2, 'ground', takes)
-        self.obstacles = Collector(self.probe, PointCloud2, 'obstacles', takes)
+        self.ground = Collector(self.probe, PointCloud2, 'ground')
+        self.obstacles = Collector(self.probe, PointCloud2, 'obstacles')
         self.diagnostics = Collector(self.probe, DiagnosticArray, '/diagnostics')
         self._clients = {}
 
@@ -369,11 +369,9 @@ class Bench(Link):
     def changed(self, values):
         """Other values of parameters within the block."""
         before = {name: self.node.config[name] for name in values}
-        try:
-            assert all(result.successful for result in self.load(values))
-            yield
-        finally:
-            self.load(before)
+        assert all(result.successful for result in self.load(values))
+        yield
+        self.load(before)
 
     def in_executor(self, function, *arguments):
         """Result of a call made between two waits, where entities may safely go."""
@@ -395,10 +393,10 @@ def bench(*words, settled=True):
 
 
 @contextlib.contextmanager
-def linked(sends=RELIABLE, takes=RELIABLE):
+def linked(sends=RELIABLE):
     """A connected `Link` to a node of another process."""
     with isolated_context() as context:
-        link = Link(context, sends, takes)
+        link = Link(context, sends)
         with spinning(context, link.probe):
             link.wait_until_connected()
             yield link

@@ -1,28 +1,17 @@
-"""Hostile clouds, files and messages: `python test/torture.py`, TORTURE_SCALE=100 for a night.
+"""Hostile clouds, files and messages: `make torture`, TORTURE_SCALE=100 for a night.
 
-Each case follows from its number. `python test/torture.py PART FIRST STOP` runs some of a part in
-this process, and prints a line for each that fails. Without words, each part runs in processes of
-a hundred cases or so, where a crash or a hang is a failure too, and a record is printed at the end
-(docs/reliability.md shows the last one).
+Each case follows from its number. A test runs a hundred or so of them; a crash or a hang of the
+process is a failure too. With TORTURE_STEP=1 each is a test of its own, which -k can choose.
 """
 
-import contextlib
-import io
 import os
-import shutil
 import signal
-import subprocess
-import sys
-import tempfile
-import time
-import warnings
 from array import array
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import pytest
 from bag_samples import scan, write_ros1_bag, write_ros2_bag
-from evaluation_samples import write_frame
 from foreign_files import CASES
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rclpy.serialization import serialize_message
@@ -31,20 +20,15 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointField
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
-from gp_ground_seg.cli import main as cli
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import parameter_specs
 from gp_ground_seg.core.pipeline.points import take_points
-from gp_ground_seg.data.cloud_files import decode_file, encode_file
+from gp_ground_seg.data.cloud_files import WRITABLE, decode_file, encode_file
 from gp_ground_seg.data.clouds import Cloud
+from gp_ground_seg.data.inputs import list_inputs
 
-TEST = Path(__file__).parent
-PARTS = {'clouds': (1000, 100), 'readers': (300, 60), 'commands': (600, 200), 'ros': (400, 200)}
-"""Number of cases of a short campaign, and of a process."""
-TIMEOUT = 900.0
-"""Time that a process may take [s]."""
 SLOWEST = 30
-"""Time that a command, or a file that is read, may take [s]."""
+"""Time that the reading of a file may take [s]."""
 MAX_DIFFERENT = 0.02
 """Share of the points that rounding may decide differently in the two backends: one candidate
 that joins or not changes the labels of its cells."""
@@ -193,13 +177,13 @@ WORDS = [
     b'DATA binary_compressed\n', b'property list uchar int a\n', b'property double x\n',
     b'element vertex 0\n', b'format ascii 1.0\n', b'nan', b'-inf', b'1e999', b'1_0',
     b"'descr': [('x', '<f4', (2,))]", b"('x', 'O')", b"'shape': (99999999999,)", b'-1', b' ',
-    b'0x10', b'\r', b'\0', b'999999999999999999999', b'\xc3\xa9', b'\xff' * 4, b'\0\0\0\x80',
+    b'*a', b'&a [*a, *a]', b'.nan', b'0x7f', b'!!python/name:os', b'~', b'[1, 2]', b'{a: b}',
+    b'?\n', b'"\\ud800"', b'\ngrid:\n', b'1' * 300, b'\t', b'0x10', b'\r', b'\0',
+    b'999999999999999999999', b'\xc3\xa9', b'\xff' * 4, b'\0\0\0\x80',
 ]  # fmt: skip
-N_INPUTS = 200
-"""Damaged files of a case of `readers`."""
 
 
-def mutant(rng, seeds, words=WORDS):
+def mutant(rng, seeds):
     """Change an input in some places, or put the halves of two together."""
     data = bytearray(seeds[rng.integers(len(seeds))])
     for _ in range(rng.integers(1, 5)):
@@ -213,7 +197,7 @@ def mutant(rng, seeds, words=WORDS):
         elif kind == 2:
             data[at : at + size] = rng.bytes(len(data[at : at + size]))
         elif kind == 3:
-            data[at:at] = words[rng.integers(len(words))]
+            data[at:at] = WORDS[rng.integers(len(WORDS))]
         elif kind == 4 and data:
             data[at % len(data)] ^= 1 << rng.integers(8)
         else:
@@ -221,157 +205,95 @@ def mutant(rng, seeds, words=WORDS):
     return bytes(data)
 
 
-def seeds_of(suffix):
-    """Whole files of a format."""
-    points = np.zeros(5, [('x', 'f4'), ('y', 'f8'), ('z', '>f4'), ('n', 'u2', (2,)), ('b', '?')])
-    seeds = [data for name, (data, _) in CASES.items() if name.endswith(suffix)]
-    own = encode_file(Path(f'a{suffix}'), Cloud(points, np.zeros((5, 3))), {})
-    return [own, *(data for data in seeds if isinstance(data, bytes))]
+def read_and_write(path):
+    """Read a file of points; written, it must be the same cloud."""
+    cloud = decode_file(path, path.read_bytes())
+    label = np.zeros(len(cloud.xyz), 'u1')
+    again = decode_file(path, encode_file(path, cloud, {'label': label}))
+    assert np.array_equal(again.xyz, cloud.xyz, equal_nan=True), 'written, another cloud'
 
 
-def try_reader(number):
-    """Read damaged files of one format: each is a cloud that can be written, or one line."""
-    rng, suffix = np.random.default_rng([48, number]), ('.pcd', '.ply', '.npy', '.npz')[number % 4]
-    path, seeds = Path(f'a{suffix}'), seeds_of(suffix)
+def read_clouds(path):
+    """Read every cloud of a scan or bag."""
+    for one in list_inputs(path):
+        one.read()
+
+
+READERS = {
+    **dict.fromkeys(WRITABLE, read_and_write),
+    **dict.fromkeys(('.bin', '.mcap', '.db3', '.bag', '.drive'), read_clouds),
+    '.yaml': Config.from_yaml,
+}
+N_INPUTS = 200
+"""Damaged files of a case of `readers`."""
+
+
+def seeds_of(suffix, path):
+    """Whole files of a format, of which some are written to `path`."""
+    if suffix in WRITABLE:
+        points = np.zeros(5, [('x', 'f4'), ('y', 'f8'), ('z', '>f4'), ('n', 'u2', 2), ('b', '?')])
+        own = encode_file(path, Cloud(points, np.zeros((5, 3))), {})
+        others = [data for name, (data, _) in CASES.items() if name.endswith(suffix)]
+        return [own, *(data for data in others if isinstance(data, bytes))]
+    if suffix == '.bin':
+        scan().tofile(path)
+    elif suffix == '.yaml':
+        path.write_text(Config().to_yaml())
+    else:
+        (write_ros1_bag if suffix == '.bag' else write_ros2_bag)(path)
+    return [(path / 'metadata.yaml' if path.is_dir() else path).read_bytes()]
+
+
+def try_reader(number, folder):
+    """Read damaged files of one format: each has clouds or parameters, or is refused in a line."""
+    rng, suffix = np.random.default_rng([48, number]), list(READERS)[number % len(READERS)]
+    path = folder / f'{number}{suffix}'
+    seeds = seeds_of(suffix, path)
     for _ in range(N_INPUTS):
         said = ''
+        (path / 'metadata.yaml' if path.is_dir() else path).write_bytes(mutant(rng, seeds))
         signal.alarm(SLOWEST)
         try:
-            cloud = decode_file(path, mutant(rng, seeds))
-            label = np.zeros(len(cloud.xyz), 'u1')
-            again = decode_file(path, encode_file(path, cloud, {'label': label}))
-            assert np.array_equal(again.xyz, cloud.xyz, equal_nan=True), 'written, another cloud'
-        except DataError as error:
+            READERS[suffix](path)
+        except (DataError, ConfigError) as error:
             said = str(error)
         finally:
             signal.alarm(0)
         assert '\n' not in said and len(said) < 800, said
 
 
-YAML_PIECES = [b'1' * 5000, *rb"""
-*a
-&a [*a, *a]
-1e999
-.nan
--.inf
-0x7f
-2011-99-99
-!!python/name:os
-~
-[1, 2]
-{a: b}
-true
-"\ud800"
--
-?
-grid:
-r_max: 1
-""".split(b'\n'), b'\t', b'\x00', b'\xff', b'\n']  # fmt: skip
-
-
-def answer(words):
-    """Exit code and stderr of a command in this process."""
-    errors = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(errors):
-            code = cli.main([str(word) for word in words])
-    except SystemExit as stop:
-        code = stop.code
-    return code, errors.getvalue()
-
-
-def make_samples(folder):
-    """Valid files: name -> (path of what is damaged, words of the command)."""
-    points = scan()
-    points.tofile(folder / 'scan.bin')
-    write_frame(folder / 'root', '00', 0, points, np.full(len(points), 40, '<u4'))
-    robot, sequence = folder / 'robot.yaml', folder / 'root/sequences/00'
-    robot.write_text(Config().to_yaml())
-    for name in ('drive.mcap', 'drive.db3', 'drive'):
-        write_ros2_bag(folder / name)
-    write_ros1_bag(folder / 'drive.bag')
-    out = ['-o', folder / 'out.mcap']
-    samples = {
-        'scan': (folder / 'scan.bin', ['segment', folder / 'scan.bin']),
-        'scan of a root': (sequence / 'velodyne/000000.bin', ['evaluate', folder / 'root']),
-        'labels': (sequence / 'labels/000000.label', ['evaluate', folder / 'root']),
-        'parameters': (robot, ['config', 'check', robot]),
-        'parameters used': (robot, ['segment', folder / 'scan.bin', '--config', robot]),
-    }
-    for name in ('drive.mcap', 'drive.db3', 'drive.bag'):
-        samples[name] = (folder / name, ['segment', folder / name, *out])
-    for path in sorted((folder / 'drive').iterdir()):
-        samples[f'drive/{path.name}'] = (path, ['segment', folder / 'drive', *out])
-    return samples
-
-
-def try_command(number, samples, folder):
-    """Damage one file, run its command, restore the file; return what is wrong, or None."""
-    rng = np.random.default_rng([41, number])
-    name = list(samples)[number % len(samples)]
-    path, words = samples[name]
-    whole = path.read_bytes()
-    output = folder / 'out.mcap'
-    try:
-        words_of_it = YAML_PIECES if path.suffix == '.yaml' else WORDS
-        path.write_bytes(mutant(rng, [whole], words_of_it))
-        started = time.monotonic()
-        try:
-            code, errors = answer(words)
-        except BaseException as error:
-            return f'{name}: {type(error).__name__}: {" ".join(str(error).split())[:200]}'
-        # `config check` prints a line for each problem, other commands one error.
-        mark = str(path) if words[1] == 'check' else 'error: '
-        n_lines = sum(mark in line for line in errors.splitlines())
-        if code not in (0, 2) or (code == 2 and not (n_lines == 1 or words[1] == 'check')):
-            return f'{name}: exit code {code}, {errors[-200:]!r}'
-        if code == 2 and output.exists():
-            return f'{name}: something was written'
-        if time.monotonic() - started > SLOWEST:
-            return f'{name}: took {time.monotonic() - started:.0f} s'
-        left = [p.name for p in folder.iterdir() if 'out' in p.name and p != output]
-        return f'{name}: left {left}' if left else None
-    finally:
-        path.write_bytes(whole)
-        for leftover in folder.glob('*out*'):
-            if leftover.is_dir():
-                shutil.rmtree(leftover)
-            else:
-                leftover.unlink()
-
-
 MAX_RSS = 1.5e9
 """Memory that the node may hold [bytes]."""
+
+
+SIZES = [0, 1, 2, 3, 12, 16, 63, 65, 1000, 2**16, 2**31 - 1, 2**31, 2**32 - 1]
+TEXTS = ['', 'x', 'y', 'z', 'label', 'ground_z', '/', 'a b', '\0', 'é' * 50, 'x' * 3000]
 
 
 def hostile_cloud(rng):
     """Cloud whose layout, sizes and fields are drawn at random, near to what is valid."""
     message = to_message(street(int(rng.choice([0, 1, 50, 500])), seed=int(rng.integers(1000))))
-    sizes = [0, 1, 2, 3, 12, 16, 63, 65, 1000, 2**16, 2**31 - 1, 2**31, 2**32 - 1]
-    for name in ('height', 'width', 'point_step', 'row_step'):
-        if rng.random() < 0.4:
-            setattr(message, name, int(rng.choice(sizes)))
+
+    def change(part, share, values, *names):
+        for name in names:
+            if rng.random() < share:
+                setattr(part, name, type(getattr(part, name))(rng.choice(values)))
+
+    change(message, 0.4, SIZES, 'height', 'width', 'point_step', 'row_step')
+    change(message, 0.2, [True], 'is_bigendian')
+    change(message.header, 0.2, TEXTS, 'frame_id')
+    change(message.header.stamp, 0.2, [-(2**31), -1, 0, 2**31 - 1], 'sec')
+    change(message.header.stamp, 0.2, [0, 10**9, 2**32 - 1], 'nanosec')
     for field in message.fields:
-        if rng.random() < 0.3:
-            field.offset = int(rng.choice(sizes))
-        if rng.random() < 0.2:
-            field.datatype = int(rng.integers(0, 256))
-        if rng.random() < 0.2:
-            field.count = int(rng.choice(sizes))
-        if rng.random() < 0.1:
-            field.name = str(rng.choice(['', 'x', 'y', 'z', 'label', 'ground_z', '\0', 'é' * 50]))
+        change(field, 0.3, SIZES, 'offset', 'count')
+        change(field, 0.2, range(256), 'datatype')
+        change(field, 0.1, TEXTS, 'name')
     if rng.random() < 0.2:
         message.fields = message.fields[: rng.integers(5)]
     if rng.random() < 0.2:
         message.fields = [*message.fields, PointField(name='x', datatype=7, count=1)]
     if rng.random() < 0.3:
         message.data = array('B', rng.bytes(int(rng.choice([0, 1, 100, 64000]))))
-    message.is_bigendian = bool(rng.random() < 0.2)
-    if rng.random() < 0.2:
-        message.header.frame_id = str(rng.choice(['', '/', 'a b', 'é', 'x' * 3000]))
-    if rng.random() < 0.2:
-        message.header.stamp.sec = int(rng.choice([-(2**31), -1, 0, 2**31 - 1]))
-        message.header.stamp.nanosec = int(rng.choice([0, 10**9, 2**32 - 1]))
     return message
 
 
@@ -399,24 +321,19 @@ def hostile_parameter(rng, kind):
     )
 
 
-def wrong_time(rng):
-    """Time of a clock, mostly negative or too large."""
-    time = Clock()
-    time.clock.sec = int(rng.choice([-(2**31), -5, -1, 0, 2**31 - 1]))
-    time.clock.nanosec = int(rng.choice([0, 10**9, 2**32 - 1]))
-    return time
-
-
 def send(number, node, link, clock):
     """Send a hostile cloud, parameters and time; after ten, a valid cloud must be answered."""
     rng = np.random.default_rng([17, number])
     cloud = hostile_cloud(rng) if rng.random() < 0.5 else damaged_message(rng)
     link.publisher.publish(cloud)
-    clock.publish(wrong_time(rng))
+    now = Clock()
+    now.clock.sec = int(rng.choice([-(2**31), -5, -1, 0, 2**31 - 1]))
+    now.clock.nanosec = int(rng.choice([0, 10**9, 2**32 - 1]))
+    clock.publish(now)
     for setter in SETTERS:
         link.request(setter, [hostile_parameter(rng, number % 256)])
     if number % 10 != 9:
-        return None
+        return
     seen = len(link.ground.messages)
     link.publish_until(
         to_message(street(2000)),
@@ -424,78 +341,43 @@ def send(number, node, link, clock):
         'answer to a valid cloud',
     )
     memory = int(Path(f'/proc/{node.popen.pid}/statm').read_text().split()[1]) * 4096
-    if memory > MAX_RSS:
-        return f'the node holds {memory / 1e6:.0f} MB'
-    _, mark, trace = node.log.partition('Traceback')
-    return f'{mark}{trace[:500]}'.replace('\n', ' | ')
+    assert memory < MAX_RSS, f'the node holds {memory / 1e6:.0f} MB'
+    assert 'Traceback' not in node.log, node.log.partition('Traceback')[2][:500]
 
 
-@contextlib.contextmanager
-def case_of(part):
-    """What runs a case of a part by its number, and returns or raises what is wrong."""
-    with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
-        warnings.simplefilter('error' if part in ('clouds', 'readers') else 'default')
-        if part in ('clouds', 'readers'):
-            yield try_cloud if part == 'clouds' else try_reader
-        elif part == 'commands':
-            samples = make_samples(Path(name))
-            yield lambda number: try_command(number, samples, Path(name))
-        else:
-            words = '-p', 'use_sim_time:=true'
-            node, link = stack.enter_context(linked_process(Path(name), *words))
-            node.wait_until_settled()
-            clock = link.probe.create_publisher(Clock, '/clock', 1)
-            yield lambda number: send(number, node, link, clock)
+def cases(n_cases, n_of_test):
+    """Numbers of the cases of a campaign, so many of them in a test."""
+    stop = max(1, round(n_cases * float(os.environ.get('TORTURE_SCALE', '1'))))
+    step = int(os.environ.get('TORTURE_STEP', n_of_test))
+    numbers = [range(k, min(k + step, stop)) for k in range(0, stop, step)]
+    return pytest.mark.parametrize('numbers', numbers, ids=lambda those: f'from {those.start}')
 
 
-def run_cases(part, first, stop):
-    """Print a line for each case that fails; the last number is that of the case at work."""
-    n_failed = 0
-    with case_of(part) as run_case:
-        for number in range(first, stop):
-            print(f'\r{number}', end='', flush=True)
-            try:
-                wrong = run_case(number)
-            except Exception as error:
-                wrong = f'{type(error).__name__}: {error}'
-            if wrong:
-                n_failed += 1
-                print(f'\rcase {number}: {wrong}', flush=True)
-    sys.exit(1 if n_failed else 0)
+def run_cases(numbers, run_case):
+    """Run every case; fail with a line for each that raises."""
+    failed = []
+    for number in numbers:
+        try:
+            run_case(number)
+        except Exception as error:
+            failed.append(f'case {number}: {type(error).__name__}: {error}')
+    assert not failed, '\n'.join(failed)
 
 
-def run_apart(part, first, stop):
-    """Run cases in a process of their own; return the lines of those that failed."""
-    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join([str(TEST.parent), str(TEST)])}
-    words = [sys.executable, __file__, part, str(first), str(stop)]
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, errors='replace',
-                              env=environment, timeout=TIMEOUT, check=False)  # fmt: skip
-    except subprocess.TimeoutExpired as error:
-        return [f'{part}: no end within {TIMEOUT:.0f} s: {error.stdout or b""!r}'[-200:]]
-    lines = [line.split('\r')[-1] for line in done.stdout.split('\n')]
-    failed = [f'{part}: {line}' for line in lines if ': ' in line]
-    if done.returncode != bool(failed):
-        failed.append(f'{part}: status {done.returncode} at {lines[-1]}: {done.stderr[-300:]}')
-    return failed
+@cases(1000, 100)
+def test_clouds(numbers):
+    run_cases(numbers, try_cloud)
 
 
-def main():
-    """Run all parts, and print the record."""
-    scale, failures = float(os.environ.get('TORTURE_SCALE', '1')), 0
-    for part, (n_cases, n_of_process) in PARTS.items():
-        stop, started = max(1, round(n_cases * scale)), time.monotonic()
-        starts = range(0, stop, n_of_process)
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            runs = [pool.submit(run_apart, part, k, min(k + n_of_process, stop)) for k in starts]
-            failed = [line for run in runs for line in run.result()]
-        took = time.monotonic() - started
-        print(*failed, f'{part:10}{stop:8} cases {took:7.0f} s {len(failed):4} failures', sep='\n')
-        failures += len(failed)
-    sys.exit(1 if failures else 0)
+@cases(300, 60)
+def test_readers(numbers, tmp_path):
+    run_cases(numbers, lambda number: try_reader(number, tmp_path))
 
 
-if __name__ == '__main__':
-    if len(sys.argv) == 1:
-        main()
-    run_cases(sys.argv[1], *map(int, sys.argv[2:]))
+@cases(400, 200)
+@pytest.mark.filterwarnings('default')
+def test_ros(numbers, tmp_path):
+    with linked_process(tmp_path, '-p', 'use_sim_time:=true') as (node, link):
+        node.wait_until_settled()
+        clock = link.probe.create_publisher(Clock, '/clock', 1)
+        run_cases(numbers, lambda number: send(number, node, link, clock))

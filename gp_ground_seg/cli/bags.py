@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_from_columns, encode_cloud
 from gp_ground_seg.data.point_cloud2 import CloudMessage
-from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
+from gp_ground_seg.data.semantic_kitti import list_frames
 from gp_ground_seg.ros.session import Session, large_cloud_transport, needing_ros, ros_session
 
 TOPIC = '/kitti/velo/pointcloud'
@@ -98,41 +97,30 @@ def scan_cloud(
 
 def run_convert(arguments: argparse.Namespace) -> int:
     """Write the bag."""
-    columns = options.columns_of(arguments)
-    frames = list_frames(arguments.root, arguments.sequence, columns)
-    stamps = [_nanoseconds(frame) for frame in frames]
-    target = Path(arguments.output)
-    n_points = 0
+    frames = list_frames(arguments.root, arguments.sequence, options.columns_of(arguments))
+    stamps = [EPOCH * 10**9 + round(frame.time * 1e9) for frame in frames]
+    if not 0 <= stamps[0] <= stamps[-1] < 2**31 * 10**9:
+        times = f'{frames[0].time:g} to {frames[-1].time:g} s'
+        raise DataError(f'times.txt of sequence {arguments.sequence}: {times}: no stamps of ROS')
+    n_points = n_labelled = 0
     with (
-        BagWriter(target, force=arguments.force) as bag,
+        BagWriter(arguments.output, force=arguments.force) as bag,
         options.progress('kitti-to-bag', quiet=arguments.quiet)(total=len(frames)) as bar,
     ):
         bag.add_topic(TOPIC)
         for frame, stamp in zip(frames, stamps, strict=True):
-            points = read_points(frame.points_path, frame.columns)
-            labels = {}
+            points, labels = frame.points, {}
             if frame.labels_path is not None:
-                labels['label'] = read_labels(frame.labels_path, len(points)).astype(np.uint32)
+                labels['label'] = frame.semantic.astype(np.uint32)
             bag.write(TOPIC, stamp, encode_cloud(scan_cloud(points, stamp, FRAME_ID, **labels)))
             n_points += len(points)
+            n_labelled += len(labels)
             bar.update()
-    n_labelled = sum(frame.labels_path is not None for frame in frames)
     n_frames, n_all = options.count(len(frames), 'frame'), options.count(n_points, 'point')
     seconds = 1e-9 * (stamps[-1] - stamps[0])
     facts = f'{n_frames} ({n_labelled} with labels), {n_all}, {seconds:.1f} s'
-    print(f'{facts}, written to {shown(target)}')
+    print(f'{facts}, written to {shown(arguments.output)}')
     return 0
-
-
-def _nanoseconds(frame: Frame) -> int:
-    """Return the stamp of a frame [ns]."""
-    last = 2**31 - 1 - EPOCH
-    if not 0 <= frame.time <= last:
-        raise DataError(
-            f'times.txt of sequence {frame.sequence}: time {frame.time:g} s of frame '
-            f'{frame.index}: must be in [0, {last}] s'
-        )
-    return EPOCH * 10**9 + round(frame.time * 1e9)
 
 
 def run_play(arguments: argparse.Namespace) -> int:

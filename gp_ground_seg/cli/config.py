@@ -47,11 +47,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run_dump(arguments: argparse.Namespace) -> int:
     """Print the parameters as YAML, with the preset's reasons for the values it has given."""
     config = options.read_config(arguments)
-    preset = find_preset(arguments.preset)
-    title = preset.title if config == preset.config else ''
-    kept = [name for name in preset.reasons if config[name] == preset.config[name]]
-    reasons = {name: preset.reasons[name] for name in kept}
-    print(config.to_yaml(title, reasons), end='')
+    print(find_preset(arguments.preset).to_yaml(config), end='')
     return 0
 
 

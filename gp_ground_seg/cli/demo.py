@@ -8,7 +8,6 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -24,10 +23,7 @@ from gp_ground_seg.lab.plotting import new_figure, plot_scan_view
 from gp_ground_seg.lab.scoring.metrics import Labels, count_labels, label_ratios, true_labels
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_scan
 from gp_ground_seg.ros.node_process import GROUND, OBSTACLES, Link, NodeProcess, private_session
-from gp_ground_seg.ros.session import needing_ros
-
-if TYPE_CHECKING:
-    from gp_ground_seg.ros.session import Session
+from gp_ground_seg.ros.session import Session, needing_ros
 
 BAG, PICTURE, LOG = 'drive.mcap', 'scan.png', 'node.log'
 TOPIC = '/points'  # of the bag
@@ -35,11 +31,11 @@ FRAME_ID = 'lidar'
 EPOCH = 1_700_000_000
 """Second at which every drive starts: the same drive gives the same bag."""
 SEED, SPEED = 3, 8.0
-"""Of the simulated drive; the second [m/s]."""
+"""Seed and speed [m/s] of the simulated drive."""
 LABELS = {GROUND: Label.GROUND, OBSTACLES: Label.OBSTACLE}
-"""Label of what comes back on each topic."""
+"""Label of the points on each topic."""
 PERIOD = 0.1
-"""Time of one turn of the sensor, and the shortest from sending one scan to the next [s]."""
+"""Time of a turn of the sensor; scans are sent no faster [s]."""
 LAST_LINES = 20
 """Of the node's log, printed when the demo fails."""
 
@@ -98,11 +94,7 @@ class Tally:
         self.n_compiled = 0
 
     def add(
-        self,
-        sent: CloudMessage,
-        back: dict[str, CloudMessage],
-        latency: float,
-        is_compiled: bool,
+        self, sent: CloudMessage, back: dict[str, CloudMessage], latency: float, is_compiled: bool
     ) -> None:
         """Add a scan and what came back of it, `latency` [s] later, by compiled code or not."""
         self.latencies.append(latency)
@@ -166,17 +158,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _write(n_frames: int, path: Path, session: Session) -> None:
     """Write the drive as a bag."""
-    scans = options.count(n_frames, 'scan')
-    print(
-        f'[1/3] writing {scans} of a simulated street as a bag; meanwhile the node starts',
-        flush=True,
-    )
+    scans = f'{options.count(n_frames, "scan")} of a simulated street'
+    print(f'[1/3] writing {scans} as a bag; meanwhile the node starts', flush=True)
     with options.progress('scans')(total=n_frames) as bar, BagWriter(path, force=True) as bag:
         bag.add_topic(TOPIC)
         for points, semantic, seconds in simulated_drive(n_frames):
             stamp = EPOCH * 10**9 + round(seconds * 1e9)
-            label = semantic.astype(np.uint32)
-            cloud = scan_cloud(points, stamp, FRAME_ID, label=label)
+            cloud = scan_cloud(points, stamp, FRAME_ID, label=semantic.astype(np.uint32))
             bag.write(TOPIC, stamp, encode_cloud(cloud))
             session.check()
             bar.update()

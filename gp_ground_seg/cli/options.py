@@ -146,13 +146,11 @@ def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:
 
     def parse(text: str) -> list[str]:
         words = [word for word in text.split(',') if word]
-        unknown = [word for word in words if word not in names]
+        unknown = next((word for word in words if word not in names), None)
         if unknown or not words or len(set(words)) < len(words):
-            wanted = ','.join(names)
-            hint = did_you_mean(unknown[0], names) if unknown else ''
-            raise argparse.ArgumentTypeError(
-                f'{text!r}: must be some of {wanted}, each once{hint}'
-            )
+            hint = did_you_mean(unknown, names) if unknown else ''
+            wanted = f'some of {",".join(names)}, each once'
+            raise argparse.ArgumentTypeError(f'{text!r}: must be {wanted}{hint}')
         return words
 
     return parse

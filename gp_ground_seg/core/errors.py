@@ -87,6 +87,16 @@ def in_thousands(number: SupportsInt) -> str:
     return f'{int(number):_}'.replace('_', ' ')
 
 
+_logged: set[str] = set()
+
+
+def log_once(level: int, text: str, *values: object) -> None:
+    """Log a message the first time that it is to be logged, whatever its values."""
+    if text not in _logged:
+        _logged.add(text)
+        LOGGER.log(level, text, *values)
+
+
 class _Handler(logging.Handler):
     def __init__(self, receive: Receive) -> None:
         super().__init__()

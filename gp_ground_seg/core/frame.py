@@ -158,16 +158,9 @@ class Candidates(NamedTuple):
     @classmethod
     def buffers(cls, n: int, n_segments: int) -> Candidates:
         """Arrays for at most `n` candidates, with arbitrary content."""
-        return cls(
-            r=np.empty(n),
-            z=np.empty(n),
-            bin=np.empty(n, np.int64),
-            density=np.empty(n),
-            offsets=np.empty(n_segments + 1, np.int64),
-            tile=np.empty(n, np.int32),
-            x=np.empty(n),
-            y=np.empty(n),
-        )
+        r, z, density, x, y = (np.empty(n) for _ in range(5))
+        places, offsets = np.empty(n, np.int64), np.empty(n_segments + 1, np.int64)
+        return cls(r, z, places, density, offsets, np.empty(n, np.int32), x, y)
 
     def first(self, n: int) -> Candidates:
         """First `n`, to which `offsets` refer already."""
@@ -179,16 +172,8 @@ class Candidates(NamedTuple):
         return self._taken(kept, before[self.offsets])
 
     def _taken(self, kept: Any, offsets: IntArray) -> Candidates:
-        return Candidates(
-            self.r[kept],
-            self.z[kept],
-            self.bin[kept],
-            self.density[kept],
-            offsets,
-            self.tile[kept],
-            self.x[kept],
-            self.y[kept],
-        )
+        columns = self._asdict() | {'offsets': offsets}
+        return Candidates(**{k: v if k == 'offsets' else v[kept] for k, v in columns.items()})
 
 
 class Scan(NamedTuple):
@@ -271,21 +256,12 @@ class GroundSurface(NamedTuple):
     std: FloatArray  # (M, K) its standard deviation [m]; NaN in the same places
     inlier: BoolArray  # (C,) candidates that the surface rests on
 
-    @usual_errors()
-    def at(self, grid: PolarGrid) -> tuple[FloatArray, FloatArray]:
-        """Height and standard deviation [m] under each point, two (N,) float64.
-
-        Linear between the knots; nearer than the first knot it is the first
-        knot's. NaN beyond the last knot and in segments without a model.
-        """
-        mean, std = (at_points(self.knots, table, grid) for table in (self.mean, self.std))
-        return mean, std
-
 
 def at_points(knots: FloatArray, table: FloatArray, grid: PolarGrid) -> FloatArray:
-    """Value under each point, (N,) float64, as `GroundSurface.at` gives it.
+    """Value under each point, (N,) float64.
 
-    `knots` (K,) are ranges [m], `table` (M, K) the values there.
+    `knots` (K,) are ranges [m], `table` (M, K) the values there, linear between the knots; nearer
+    than the first knot it is the first knot's. NaN beyond the last knot.
     """
     level, slope = linear_pieces(knots, table)
     cell = as_index(grid.cell)  # where it is negative, the value does not matter

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.frame import FloatArray, usual_errors
+from gp_ground_seg.core.frame import FloatArray, IntArray, PointArray, usual_errors
 from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.core.result import Segmentation
 
 N_ITERATIONS = 12
-"""Steps along the z axis of a tilted frame to the ground; each leaves slope times tangent of
-the tilt of the error before."""
+"""Steps along the z axis of a tilted frame to the ground: each reduces the error by slope times
+tangent of the tilt."""
 STEEPEST = 0.1
-"""Cosine of the tilt from which on the z axis is taken to meet the ground."""
+"""Cosine of the tilt below which the z axis is not taken to meet the ground."""
+
+
+def segment_of(x: PointArray, y: PointArray, n_segments: int) -> IntArray:
+    """Which of `n_segments` equal segments, counter-clockwise from -x, finite places lie in."""
+    turn = np.arctan2(y, x) / (2.0 * np.pi) + 0.5
+    return (turn * n_segments).astype(np.int64) % n_segments
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,51 +76,20 @@ class GroundModel:
         return self.roll == 0.0 and self.pitch == 0.0
 
     @usual_errors()
-    def knot_points(self, n_std: float = 0.0) -> FloatArray:
+    def knot_points(self) -> FloatArray:
         """Place of every knot in the middle of its segment, frame of the scan, (M, K, 3) [m].
 
         NaN where there is no model.
-
-        Parameters
-        ----------
-        n_std : float
-            Standard deviations above the ground, upright.
         """
         azimuth = self.azimuth[:, None]
-        height = self.height + n_std * self.std
-        known = np.isfinite(height)
-        level = np.stack(
-            [
-                np.where(known, self.knots * np.cos(azimuth), np.nan),
-                np.where(known, self.knots * np.sin(azimuth), np.nan),
-                height,
-            ],
-            axis=-1,
-        )
-        if self.is_level:
-            return level
-        points: FloatArray = level @ rotation(self.roll, self.pitch)
-        return points
+        along = (self.knots * np.cos(azimuth), self.knots * np.sin(azimuth), self.height)
+        level = np.where(np.isfinite(self.height)[..., None], np.stack(along, axis=-1), np.nan)
+        return level if self.is_level else np.asarray(level @ rotation(self.roll, self.pitch))
 
     @classmethod
     @usual_errors()
-    def from_knot_points(
-        cls,
-        points: FloatArray,
-        knots: FloatArray,
-        std: FloatArray,
-        length_scale: FloatArray,
-        roll: float,
-        pitch: float,
-    ) -> GroundModel:
-        """Model from what `knot_points` gave, rounded or not.
-
-        Parameters
-        ----------
-        points : (M, K, 3) float array
-            Knots of all segments [m].
-        knots, std, length_scale, roll, pitch
-            As in the attributes.
+    def from_columns(cls, columns: Mapping[str, npt.NDArray[np.floating]]) -> GroundModel:
+        """Model from the columns, (M, K) each, of a cloud of ``~/ground_model``, rounded or not.
 
         Raises
         ------
@@ -121,27 +97,24 @@ class GroundModel:
             If the knots of the segments do not lie at their ranges in the middle of
             equal segments.
         """
+        points = np.stack([columns[axis] for axis in 'xyz'], axis=-1)
         n_segments, n_knots = points.shape[:2]
         if n_segments < 1 or n_knots < 2:
             raise PointCloudError(
                 f'ground model of {n_segments} segments and {n_knots} knots: '
                 'must have at least 1 segment and 2 knots'
             )
+        numbers = {name: column.astype(np.float64) for name, column in columns.items()}
+        roll, pitch = (float(numbers[name][0, 0]) for name in ('roll', 'pitch'))
         with np.errstate(invalid='ignore'):
-            level = points.astype(np.float64) @ rotation(roll, pitch).T
-        model = cls(
-            knots.astype(np.float64),
-            level[..., 2],
-            np.asarray(std, dtype=np.float64),
-            np.asarray(length_scale, dtype=np.float64),
-            roll,
-            pitch,
-        )
+            height = (points.astype(np.float64) @ rotation(roll, pitch).T)[..., 2]
+        knots, rest = numbers['range'][0], (numbers['std'], numbers['length_scale'])
+        model = cls(knots, height, *rest, roll, pitch)
         with np.errstate(invalid='ignore'):
             strays = np.abs(points - model.knot_points()).max(axis=-1)
-        # Not above: where x and y are NaN and z is not, so is the distance.
-        near = (strays <= 1e-5 * (1.0 + model.knots)) | np.isnan(level[..., 2])
-        if not (np.all(np.diff(model.knots) > 0.0) and near.all()):
+        # Where x and y are NaN and z is not, so is the distance, and the knot is no near one.
+        near = (strays <= 1e-5 * (1.0 + knots)) | np.isnan(height)
+        if not (np.all(np.diff(knots) > 0.0) and near.all()):
             raise PointCloudError(
                 'ground model: points are no grid of segments and ranges about the sensor; '
                 'was the cloud transformed or filtered?'
@@ -170,18 +143,16 @@ class GroundModel:
             the last knot, where there is no model, and for places that are not finite.
         """
         x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
-        if self.is_level:
-            return self._over_level(x, y)
-        matrix = rotation(self.roll, self.pitch)
-        if abs(matrix[2, 2]) < STEEPEST:
-            nothing = np.full(x.shape, np.nan)
-            return nothing, nothing.copy()
         finite = np.isfinite(x) & np.isfinite(y)
         x, y = np.where(finite, x, np.nan), np.where(finite, y, np.nan)
+        if self.is_level:
+            return self._over_level(x, y)
+        matrix, z, std = rotation(self.roll, self.pitch), *np.full((2, *x.shape), np.nan)
+        if abs(matrix[2, 2]) < STEEPEST:
+            return z, std
         known = self.height[np.isfinite(self.height)]
         start = float(np.median(known)) if len(known) else 0.0
         z = (start - matrix[2, 0] * x - matrix[2, 1] * y) / matrix[2, 2]
-        std = np.full(x.shape, np.nan)
         for _ in range(N_ITERATIONS):
             level = np.stack([x, y, z], axis=-1) @ matrix.T
             height, std = self._over_level(level[..., 0], level[..., 1])
@@ -189,23 +160,16 @@ class GroundModel:
         return z, std
 
     def _over_level(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Height and standard deviation at places of the level frame."""
-        finite = np.isfinite(x) & np.isfinite(y)
-        x, y = np.where(finite, x, 0.0), np.where(finite, y, 0.0)
-        n_segments, n_knots = self.height.shape
-        turn = np.arctan2(y, x) / (2.0 * np.pi) + 0.5
-        segment = (turn * n_segments).astype(np.int64) % n_segments
+        """Height and standard deviation at places of the level frame; NaN for those of NaN."""
         r = np.hypot(x, y)
-        left = np.clip(np.searchsorted(self.knots, r, side='right') - 1, 0, n_knots - 2)
+        known = r < self.knots[-1]
+        r, x, y = (np.where(known, values, 0.0) for values in (r, x, y))
+        segment = segment_of(x, y, len(self.height))
+        left = np.clip(np.searchsorted(self.knots, r, side='right') - 1, 0, len(self.knots) - 2)
         near, far = self.knots[left], self.knots[left + 1]
         weight = np.clip((r - near) / (far - near), 0.0, 1.0)
-        known = finite & (r < self.knots[-1])
         height, std = (
-            np.where(
-                known,
-                table[segment, left] * (1.0 - weight) + table[segment, left + 1] * weight,
-                np.nan,
-            )
+            table[segment, left] * (1.0 - weight) + table[segment, left + 1] * weight
             for table in (self.height, self.std)
         )
-        return height, std
+        return np.where(known, height, np.nan), np.where(known, std, np.nan)

@@ -1,9 +1,8 @@
 """The one policy for code compiled with numba, which is optional, and for keeping it on disk.
 
-Each compiled function has a file of its own, with a checksum, in a folder of the user whose name
-is a digest of our sources and of versions: code of other sources is never read. A file that does
-not fit its checksum, as after a power cut, is compiled again. Of several processes one compiles a
-function, and the others wait for its file.
+Each compiled function has a file with a checksum, in a folder of the user that is named by our
+sources and by versions: code of other sources is never read, and a file that is damaged is
+compiled again. Of several processes one compiles, and the others wait for its files.
 """
 
 from __future__ import annotations
@@ -22,9 +21,11 @@ import time
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import IO, Any, TypeVar
 
 import numpy as np
+
+from gp_ground_seg.core.errors import log_once
 
 # Ubuntu 24.04 has no package of numba. Its import takes most of a second: it waits until something
 # is to be compiled.
@@ -32,20 +33,15 @@ HAVE_NUMBA = importlib.util.find_spec('numba') is not None
 JIT_ENABLED = HAVE_NUMBA and os.environ.get('NUMBA_DISABLE_JIT', '0') in ('', '0')
 """Whether functions are compiled, rather than left plain Python."""
 
-_LOGGER = logging.getLogger('gp_ground_seg')
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 _CORE = Path(__file__).parent
 _entry_points: list[Any] = []
 _shared: list[Callable[..., Any]] = []
 _ALL, _LOCK = 'all', 'lock'
 _CHECKSUM_SIZE = hashlib.sha256().digest_size
-_is_not_kept = False
-_turn: int | None = None  # file descriptor of the lock, while this process compiles
-_patience = 120.0  # how long to wait for others, in all [s]: one may be suspended
-
-
-class _Decorator(Protocol):
-    def __call__(self, function: _Function) -> _Function: ...
+_kept: dict[str, str] = {}  # by function, a file of it that this process has read or written
+_turn: IO[bytes] | None = None  # the file that is locked while a process compiles
+_patience = 120.0  # longest wait for others, in all [s]: one may be suspended
 
 
 def shared(function: _Function) -> _Function:
@@ -68,7 +64,7 @@ def compiled_form(
     *,
     fastmath: bool = False,
     single: Callable[..., Any] | None = None,
-) -> _Decorator:
+) -> Callable[[_Function], _Function]:
     """Return a decorator for what runs in compiled code where it calls `plain`.
 
     For functions that are a call of numpy to arrays, and a loop or a branch to compiled code.
@@ -97,7 +93,9 @@ def _options(fastmath: bool = False) -> dict[str, Any]:
     return options
 
 
-def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _Decorator:
+def jit(
+    *, fastmath: bool = False, entry: bool = False, part: bool = False
+) -> Callable[[_Function], _Function]:
     """Return a decorator that compiles a function where numba is installed.
 
     Compiled functions release the interpreter's lock. Only `entry` functions are compiled for
@@ -145,13 +143,10 @@ def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _
 
 
 class _CodeFiles:
-    """Files of the compiled forms of a function, in place of numba's own, which have no checksum.
+    """Files of one function, in place of numba's own cache, which has no checksums.
 
-    A numba dispatcher calls `load_overload` before it compiles a form, and `save_overload` after
-    it.
+    A numba dispatcher asks for each type of arguments, and hands over what it compiles.
     """
-
-    kept: ClassVar[dict[str, str]] = {}  # a file of each function that is loaded or saved
 
     def __init__(self, folder: Path, name: str) -> None:
         self.cache_path, self._name = folder, name
@@ -165,23 +160,23 @@ class _CodeFiles:
         if (code := _read_whole(path)) is None:
             _begin_turn(self.cache_path)
             if (code := _read_whole(path)) is None:
-                _announce_compiling()
+                log_once(logging.INFO, 'compiling for this processor, which takes 20 to 60 s')
                 return None
             _end_turn()  # another process has compiled it meanwhile
-        self._note(path)
+        self._list(path)
         return CompileResult._rebuild(target, *pickle.loads(code))
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Write a form that is compiled; a full disk is a warning."""
+        """Write what was compiled; a full disk is a warning."""
         from numba.core.serialize import dumps
 
         path = self._path(signature, result.codegen)
         try:
             if not result.library.has_dynamic_globals:  # addresses in this process
                 _write_whole(path, dumps(result._reduce()))
-                self._note(path)
+                self._list(path)
         except OSError as error:
-            _log_not_kept(str(error))
+            _log_not_kept(error)
         finally:
             _end_turn()
 
@@ -190,12 +185,12 @@ class _CodeFiles:
         digest = hashlib.sha256(key.encode()).hexdigest()[:16]
         return self.cache_path / f'{self._name}-{digest}'
 
-    def _note(self, path: Path) -> None:
-        """List the files that a frame needs, once each function has one."""
-        self.kept[self._name] = path.name
-        if len(self.kept) == len(_entry_points) and not is_code_kept():
+    def _list(self, path: Path) -> None:
+        """Write the list of files that a frame needs, once each function has one."""
+        _kept[self._name] = path.name
+        if len(_kept) == len(_entry_points) and not is_code_kept():
             with contextlib.suppress(OSError):
-                _write_whole(self.cache_path / _ALL, '\n'.join(self.kept.values()).encode())
+                _write_whole(self.cache_path / _ALL, '\n'.join(_kept.values()).encode())
 
 
 def _read_whole(path: Path) -> bytes | None:
@@ -225,10 +220,8 @@ def _write_whole(path: Path, data: bytes) -> None:
 def _begin_turn(folder: Path) -> None:
     """Wait until no other process compiles, or the patience is at an end."""
     global _turn, _patience
-    if _turn is not None:
-        return
     with contextlib.suppress(OSError):  # the disk is full, or has no locks
-        _turn = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        _turn = _turn or (folder / _LOCK).open('ab')
         while _patience > 0.0:
             try:
                 return fcntl.flock(_turn, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -243,26 +236,17 @@ def _end_turn() -> None:
     if _turn is not None:
         with contextlib.suppress(OSError):
             fcntl.flock(_turn, fcntl.LOCK_UN)  # a forked process may have it open
-        os.close(_turn)
+        _turn.close()
         _turn = None
 
 
-@functools.cache
-def _announce_compiling() -> None:
-    """Log once that code is compiled."""
-    _LOGGER.info('compiling for this processor, which takes 20 to 60 s')
-
-
-def _log_not_kept(reason: str) -> None:
-    """Log once that code is compiled at every start."""
-    global _is_not_kept
-    if not _is_not_kept:
-        _is_not_kept = True
-        _LOGGER.warning(
-            'compiled code is not kept on disk (%s): every start compiles, which takes 20 to '
-            '60 s; set NUMBA_CACHE_DIR to a folder of your own',
-            reason,
-        )
+def _log_not_kept(reason: Exception) -> None:
+    log_once(
+        logging.WARNING,
+        'compiled code is not kept on disk (%s): every start compiles, which takes 20 to 60 s; '
+        'set NUMBA_CACHE_DIR to a folder of your own',
+        reason,
+    )
 
 
 @functools.cache
@@ -282,7 +266,7 @@ def code_folder() -> Path | None:
         folder = folder.resolve()
         _require_private(folder)
     except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home
-        _log_not_kept(str(error))
+        _log_not_kept(error)
         return None
     return folder
 
@@ -309,21 +293,15 @@ def _digest() -> str:
     return digest.hexdigest()[:16]
 
 
-def count_ready() -> tuple[int, int]:
-    """How many functions are compiled or loaded in this process, and how many there are."""
-    return sum(bool(entry.overloads) for entry in _entry_points), len(_entry_points)
-
-
 def has_to_compile() -> bool:
-    """Whether the first frame in compiled code would take long: none is kept, none is at hand."""
-    n_ready, n_functions = count_ready()
-    return JIT_ENABLED and not (0 < n_functions == n_ready or is_code_kept())
+    """Whether the first frame in compiled code would take long."""
+    return JIT_ENABLED and not is_code_kept()
 
 
 def is_code_kept() -> bool:
     """Whether all code that a frame needs lies on disk, whole."""
     folder = code_folder()
-    names = _read_whole(folder / _ALL) if folder else None
+    names = folder and _read_whole(folder / _ALL)
     if not (folder and names):
         return False
     return all(_read_whole(folder / name) is not None for name in names.decode().splitlines())

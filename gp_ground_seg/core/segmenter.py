@@ -5,22 +5,21 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import logging
 import math
 import os
 import textwrap
 import threading
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from numbers import Real
 from pathlib import Path
-from typing import Any, NoReturn
+from time import perf_counter
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.backend import Backend, make_backend
-from gp_ground_seg.core.errors import ConfigError
+from gp_ground_seg.core.errors import LOGGER, ConfigError
 from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_errors
 from gp_ground_seg.core.gp.learning import Learned
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
@@ -59,24 +58,18 @@ from gp_ground_seg.core.pipeline.up_axis import (
 )
 from gp_ground_seg.core.result import Segmentation
 
-LARGEST_KEPT = 31 * 2**20
-"""Arrays up to this size are kept by the process when they are freed [bytes]."""
-_LOGGER = logging.getLogger('gp_ground_seg')
-
 
 class GroundSegmenter:
     """Splits scans into ground and obstacles.
 
     It may be called from several threads, which then take turns, and in a forked process. It
-    cannot be copied or pickled: another process makes its own from the same `Config`.
+    cannot be pickled: another process makes its own from the same `Config`.
 
     Parameters
     ----------
     config : Config, str, Path, dict or None
         Parameters; name of a preset; YAML file (a word with its suffix, or a Path); values by
         dotted name; None for the defaults. `configure` changes them between scans.
-    clock : callable
-        Source of the seconds in ``Segmentation.timings``.
     backend : Backend, optional
         Backend to use until the parameters ``runtime`` change; by default one made from them.
     **parameters
@@ -94,12 +87,10 @@ class GroundSegmenter:
         self,
         config: Config | str | Path | Mapping[str, Any] | None = None,
         *,
-        clock: Callable[[], float] = time.perf_counter,
         backend: Backend | None = None,
         **parameters: Any,
     ) -> None:
         keep_freed_memory()
-        self._clock = clock
         self._config = config_of(config, **parameters)
         self._backend = make_backend(self._config.runtime) if backend is None else backend
         self._warned: set[str] = set()
@@ -144,7 +135,7 @@ class GroundSegmenter:
             `fallback` is no `SensorPose`, or `box_frame` no rotation and translation.
         """
         with self._exclusive():
-            timer, sensor = StageTimer(self._clock), self._config.sensor
+            timer, sensor = StageTimer(), self._config.sensor
             if tilt is not None:
                 roll, pitch = _finite_numbers('tilt', tilt, 2)
                 sensor = dataclasses.replace(sensor, roll=roll, pitch=pitch)
@@ -152,7 +143,7 @@ class GroundSegmenter:
                 x, y, z = _finite_numbers('origin', origin, 3)
                 sensor = dataclasses.replace(sensor, origin_x=x, origin_y=y, origin_z=z)
             if not (fallback is None or isinstance(fallback, SensorPose)):
-                raise ConfigError(f'fallback = {_shortened(fallback)}: must be a SensorPose')
+                raise _refused('fallback', fallback, 'a SensorPose')
             xyz = take_points(points, (sensor.origin_x, sensor.origin_y, sensor.origin_z))
             box = self._config.input.crop_box
             if box != NO_BOX:
@@ -232,26 +223,12 @@ class GroundSegmenter:
         with self._exclusive():
             self._backend = backend
 
-    def __enter__(self) -> GroundSegmenter:
-        """Return the segmenter itself: as a context manager it has nothing to end."""
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        """Do nothing."""
-
-    def __reduce__(self) -> NoReturn:
-        """Refuse to be pickled or copied: there is a lock."""
-        raise TypeError(
-            'a GroundSegmenter cannot be pickled or copied: pass its config, and make a '
-            'GroundSegmenter of that'
-        )
-
     def _warn(self, warnings: tuple[str, ...]) -> None:
         """Log each warning once, until the parameters change: scans come ten times a second."""
         for line in warnings:
             if line not in self._warned:
                 self._warned.add(line)
-                _LOGGER.warning(line)
+                LOGGER.warning(line)
 
     def _exclusive(self) -> threading.RLock:
         """Lock that callers from several threads hold in turn."""
@@ -346,7 +323,7 @@ def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[flo
         are_numbers = all(isinstance(v, Real) and not isinstance(v, bool) for v in given)
         if are_numbers and len(given) == count and all(map(math.isfinite, given)):
             return tuple(map(float, given))
-    raise ConfigError(f'{name} = {_shortened(values)}: must be {count} finite numbers')
+    raise _refused(name, values, f'{count} finite numbers')
 
 
 def _checked_frame(
@@ -359,32 +336,22 @@ def _checked_frame(
         turn, move = (np.asarray(part, dtype=np.float64) for part in frame)
         if (turn.shape, move.shape) == ((3, 3), (3,)) and np.isfinite([*turn, move]).all():
             return turn, move
-    raise ConfigError(
-        f'box_frame = {_shortened(frame)}: must be a rotation (3, 3) and a translation (3,)'
-    )
+    raise _refused('box_frame', frame, 'a rotation (3, 3) and a translation (3,)')
 
 
-def _shortened(value: object) -> str:
-    return textwrap.shorten(repr(value), 100, placeholder=' ...')
+def _refused(name: str, value: object, wanted: str) -> ConfigError:
+    shown = textwrap.shorten(repr(value), 100, placeholder=' ...')
+    return ConfigError(f'{name} = {shown}: must be {wanted}')
 
 
 def warm_up(config: Config | None = None) -> Backend:
     """Compile or load all code that a frame needs, and return a backend that uses it.
 
-    A small scan of single precision, the type of most sensors, is segmented. Where
-    numba is not installed, or not asked for, there is nothing to compile.
-
-    Parameters
-    ----------
-    config : Config, optional
-        Parameters; hyper-parameters are learned even if ``learning.mode`` is fixed.
-
-    Raises
-    ------
-    MissingDependencyError
-        If ``runtime.backend`` is numba and numba is not installed.
+    A small scan of single precision, the type of most sensors, is segmented, and hyper-parameters
+    are learned whatever ``learning.mode`` is. Raises a MissingDependencyError if
+    ``runtime.backend`` is numba and numba is not installed.
     """
-    config = config if config is not None else Config()
+    config = config or Config()
     segmenter = GroundSegmenter(config.replace(**{'learning.mode': 'every_frame'}))
     azimuth, r = np.meshgrid(np.linspace(-3.0, 3.0, 400), np.geomspace(2.5, 30.0, 30))
     xyz = np.stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full_like(r, -1.73)], axis=-1)
@@ -398,30 +365,22 @@ def warm_up(config: Config | None = None) -> Backend:
 def keep_freed_memory() -> None:
     """Have the process keep the memory of a frame for the next one.
 
-    What a frame frees, glibc gives back to the system, which maps and clears thousands of pages
-    anew for the next, 1 to 2 us each. How much it keeps follows from the largest block freed so
-    far, up to 32 MB (mallopt(3), M_MMAP_THRESHOLD); the pages of this one are never touched.
+    glibc gives freed memory back to the system, which clears thousands of pages anew for the next
+    frame, 1 to 2 us each, but for blocks up to the largest that was freed before, at most 32 MB
+    (mallopt(3), M_MMAP_THRESHOLD). The pages of this one are never touched.
     """
-    np.empty(LARGEST_KEPT, np.uint8)
+    np.empty(31 * 2**20, np.uint8)
 
 
 class StageTimer:
-    """Time of each stage.
+    """Seconds of each stage, and in total."""
 
-    Parameters
-    ----------
-    clock : callable
-        Returns seconds; only differences are used.
-    """
-
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self._clock = clock
-        self._start = self._last = clock()
+    def __init__(self) -> None:
+        self._start = self._last = perf_counter()
         self.seconds: dict[str, float] = {}
 
     def mark(self, stage: str) -> None:
         """Record the seconds since the previous mark under `stage`."""
-        now = self._clock()
-        self.seconds[stage] = now - self._last
-        self.seconds['total'] = now - self._start
+        now = perf_counter()
+        self.seconds |= {stage: now - self._last, 'total': now - self._start}
         self._last = now

@@ -2,20 +2,18 @@
 
 And the clouds in them: messages of rosbags, and their CDR bytes.
 
-The one module that imports rosbags, mcap and zstandard, optional packages; only where a bag is
-used. Why not rosbags for MCAP and rosbag2 folders: a channel of protobuf or JSON, no profile, or
-one line of metadata.yaml that is not needed stop it (test/foreign_files.py).
+The one module that imports rosbags and mcap, optional packages; only where a bag is used. Why not
+rosbags for single MCAP files: a channel of protobuf or JSON, or no profile, stops it
+(test/foreign_files.py).
 """
 
 from __future__ import annotations
 
 import functools
 import os
-import sqlite3
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack
 from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,23 +23,18 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError, PointCloudError, in_one_line, require
 from gp_ground_seg.data.bag_files import (
-    BAG_SUFFIXES,
     METADATA_FILE,
-    PACKED_SUFFIXES,
     POINT_CLOUD2,
+    REPAIR,
     STORAGE_OF_SUFFIX,
     SUFFIX_OF_STORAGE,
-    check_is_bag,
     check_sqlite_file,
-    list_files,
-    reading,
     resolve_storage,
+    storage_of,
 )
 from gp_ground_seg.data.clouds import check_numbers, gather
-from gp_ground_seg.data.files import staged_bag_folder, staged_file, writing
+from gp_ground_seg.data.files import naming, staged_bag_folder, staged_file, writing
 from gp_ground_seg.data.point_cloud2 import DATATYPES, CloudMessage
-
-_MCAP_MAGIC = b'\x89MCAP0\r\n'
 
 
 @functools.cache
@@ -54,88 +47,48 @@ def jazzy_types() -> Any:
 
 
 class _Channel(NamedTuple):
-    """Messages of one topic, type and encoding in one file."""
+    """Messages of one topic and type in one bag."""
 
     topic: str
     msgtype: str
     encoding: str
     n_messages: int
 
-    @property
-    def kind(self) -> str:
-        """Its type, with its encoding where that is not CDR."""
-        parts = (self.msgtype, self.encoding if self.encoding != 'cdr' else '')
-        return ', '.join(filter(None, parts))
-
 
 _Messages = Iterator[tuple[str, int, bytes]]
 """Topic, recorded time [ns] and bytes of each."""
-_Storage = tuple[list[_Channel], Callable[[Collection[str]], _Messages]]
-"""Channels of one file of a bag, and what reads the CDR messages of some topics in it."""
+_Contents = tuple[list[_Channel], Callable[[Collection[str]], _Messages]]
+"""Channels of a bag, and what reads the CDR messages of some topics in it."""
 
 
-def _open_ros1(path: Path, stack: ExitStack) -> _Storage:
-    """Open a ``.bag``. Its clouds become CDR, which other messages are not."""
-    from rosbags import rosbag1
+def _open_ros(path: Path, storage: str, stack: ExitStack) -> _Contents:
+    """Open a ROS 1 ``.bag``, whose clouds become CDR, a rosbag2 folder, or a ``.db3``."""
+    from rosbags import rosbag1, rosbag2
 
-    bag = rosbag1.Reader(path)
-    bag.open()
-    stack.callback(bag.close)
-
-    clouds = [c for c in bag.connections if c.msgtype == POINT_CLOUD2]
-
-    def read(topics: Collection[str]) -> _Messages:
-        for c, time, raw in bag.messages([c for c in clouds if c.topic in topics]):
-            yield c.topic, time, jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2)
-
-    channels = []
-    for c in bag.connections:
-        encoding = 'cdr' if c in clouds else 'ros1'
-        channels.append(_Channel(c.topic, c.msgtype, encoding, c.msgcount))
-    return channels, read
-
-
-def _open_sqlite(path: Path, stack: ExitStack) -> _Storage:
-    """Open a ``.db3`` of any version of rosbag2."""
-    check_sqlite_file(path)
-    address = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
-    bag = stack.enter_context(closing(sqlite3.connect(address, uri=True, check_same_thread=False)))
-    rows = bag.execute(
-        'SELECT name, type, serialization_format, count(topic_id) FROM topics '
-        'LEFT JOIN messages ON topics.id = topic_id GROUP BY topics.id'
-    )
-    channels = [_Channel(*row) for row in rows]
+    is_ros1 = storage == 'ros1'
+    if storage == 'sqlite3':
+        for file in path.glob('*.db3') if path.is_dir() else [path]:
+            check_sqlite_file(file)
+    bag = stack.enter_context(rosbag1.Reader(path) if is_ros1 else rosbag2.Reader(path))
+    readable = [c for c in bag.connections if not is_ros1 or c.msgtype == POINT_CLOUD2]
+    channels = [
+        _Channel(c.topic, c.msgtype, 'cdr' if c in readable else 'ros1', c.msgcount or 0)
+        for c in bag.connections
+    ]
 
     def read(topics: Collection[str]) -> _Messages:
-        chosen = f"name IN ({', '.join('?' * len(topics))}) AND serialization_format = 'cdr'"
-        yield from bag.execute(
-            'SELECT (SELECT name FROM topics WHERE topics.id = topic_id), timestamp, data '
-            f'FROM messages WHERE topic_id IN (SELECT id FROM topics WHERE {chosen}) '
-            'ORDER BY timestamp, id',
-            list(topics),
-        )
+        for c, time, raw in bag.messages([c for c in readable if c.topic in topics]):
+            cdr = jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2) if is_ros1 else raw
+            yield c.topic, time, bytes(cdr)
 
     return channels, read
 
 
-def _open_mcap(path: Path, stack: ExitStack) -> _Storage:
+def _open_mcap(path: Path, stack: ExitStack) -> _Contents:
     """Open an ``.mcap``. Without an index of its chunks it is read in the order of the file."""
     library = require('mcap.reader', 'mcap')
     file = stack.enter_context(path.open('rb'))
-    if file.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
-        raise ValueError('no MCAP, or empty')
-    file.seek(-len(_MCAP_MAGIC), os.SEEK_END)
-    if file.read() != _MCAP_MAGIC:
-        raise ValueError(
-            'truncated, or still being recorded; `mcap recover` saves the readable part'
-        )
-    file.seek(0)
     bag = library.SeekingReader(file, validate_crcs=True)
-    if bag.get_header().profile == 'ros1':
-        raise ValueError(
-            'its profile is ros1; give the .bag that it was made from, or convert that by '
-            '`rosbags-convert --src IN.bag --dst OUT`'
-        )
     summary = bag.get_summary()
     is_indexed = bool(summary and summary.chunk_indexes)
     counts = summary.statistics.channel_message_counts if summary and summary.statistics else {}
@@ -155,22 +108,9 @@ def _open_mcap(path: Path, stack: ExitStack) -> _Storage:
 
     found = []
     for c in channels.values():
-        msgtype = schemas[c.schema_id].name if c.schema_id else ''
+        msgtype = schemas[c.schema_id].name if c.schema_id else 'no type'
         found.append(_Channel(c.topic, msgtype, c.message_encoding, counts.get(c.id, 0)))
     return found, read
-
-
-_OPENERS = {'ros1': _open_ros1, 'sqlite3': _open_sqlite, 'mcap': _open_mcap}
-
-
-def _open_storage(file: Path, storage: str, stack: ExitStack) -> _Storage:
-    """Open one file of a bag; a packed one is unpacked first."""
-    if file.suffix in PACKED_SUFFIXES:
-        plain = Path(stack.enter_context(tempfile.TemporaryDirectory()), file.stem)
-        with file.open('rb') as source, plain.open('wb') as target:
-            require('zstandard', 'mcap').ZstdDecompressor().copy_stream(source, target)
-        file = plain
-    return _OPENERS[storage](file, stack)
 
 
 class BagReader(AbstractContextManager['BagReader']):
@@ -179,52 +119,54 @@ class BagReader(AbstractContextManager['BagReader']):
     `path` is a ROS 1 ``.bag``, whose clouds are converted, a rosbag2 folder, ``.mcap`` or
     ``.db3``. Topics of other encodings are listed, and not read. Raises DataError if it cannot be
     read, MissingDependencyError without rosbags and mcap.
+
+    Attributes
+    ----------
+    topics : dict of str to str
+        Type of the messages of each topic; those not in CDR with their encoding.
+    storage : str
+        ``ros1``, ``mcap`` or ``sqlite3``.
     """
 
     def __init__(self, path: str | Path) -> None:
         require('rosbags.highlevel', 'rosbags mcap')
         self.path = Path(path)
+        self.storage = storage_of(self.path)
         with ExitStack() as stack:
-            with reading(self.path):
-                check_is_bag(self.path)
-                files, self._counts, self._is_packed = list_files(self.path)
-                suffix = next(word for word in files[0].suffixes[::-1] if word in BAG_SUFFIXES)
-                self.storage = STORAGE_OF_SUFFIX.get(suffix, 'ros1')
-                self._storages = [_open_storage(file, self.storage, stack) for file in files]
+            with self._naming():
+                if self.path.suffix == '.mcap' and self.path.is_file():
+                    channels, self._read = _open_mcap(self.path, stack)
+                else:
+                    channels, self._read = _open_ros(self.path, self.storage, stack)
             self._open = stack.pop_all()
-        self._channels: dict[str, list[_Channel]] = {}
-        for channels, _ in self._storages:
-            for channel in channels:
-                self._channels.setdefault(channel.topic, []).append(channel)
-        # Messages that are not CDR are skipped on a topic that has others.
-        for name, channels in self._channels.items():
-            self._channels[name] = [c for c in channels if c.encoding == 'cdr'] or channels
+        self.topics: dict[str, str] = {}
+        self._counts: dict[str, int] = {}
+        self._in_cdr: list[str] = []
+        for name in dict.fromkeys(channel.topic for channel in channels):
+            every = [c for c in channels if c.topic == name]
+            # Messages that are not CDR are skipped on a topic that has others.
+            cdr = [c for c in every if c.encoding == 'cdr']
+            kinds = {c.msgtype for c in cdr} or {f'{c.msgtype}, {c.encoding}' for c in every}
+            self.topics[name] = ' and '.join(sorted(kinds))
+            self._counts[name] = sum(c.n_messages for c in cdr or every)
+            self._in_cdr += [name] if cdr else []
 
     def __exit__(self, *error: object) -> None:
         """Close the files; nothing can be read afterwards."""
         self._open.close()
 
-    @property
-    def topics(self) -> dict[str, str]:
-        """Type of the messages of each topic; those not in CDR with their encoding."""
-        return {
-            name: ' and '.join(sorted({channel.kind for channel in channels}))
-            for name, channels in self._channels.items()
-        }
+    def _naming(self) -> AbstractContextManager[None]:
+        repair = REPAIR['' if self.path.is_dir() else self.path.suffix]
+        return naming(self.path, f'cannot be read as a bag; if it is damaged, {repair}')
 
     def _list_topics(self) -> str:
         return ', '.join(f'{name} ({kind})' for name, kind in self.topics.items()) or 'none'
 
-    def _is_readable(self, topic: str) -> bool:
-        """Whether the messages of a topic are of one type in CDR."""
-        channels = self._channels[topic]
-        return channels[0].encoding == 'cdr' and len({c.msgtype for c in channels}) == 1
-
     def n_messages(self, topic: str) -> int:
         """Messages of one topic; raises DataError if there is none of that name."""
-        if topic not in self._channels:
+        if topic not in self.topics:
             raise DataError(f'{self.path}: no topic {topic}; topics here: {self._list_topics()}')
-        return self._counts.get(topic, sum(c.n_messages for c in self._channels[topic]))
+        return self._counts[topic]
 
     def pick_point_cloud_topic(self, topic: str | None = None) -> str:
         """Return `topic` if it has point clouds, or the only one that has; else a DataError."""
@@ -252,23 +194,21 @@ class BagReader(AbstractContextManager['BagReader']):
     def messages(self, topics: Collection[str] | None = None) -> _Messages:
         """Topic, recorded time [ns] and CDR bytes of each message, by default of all in CDR.
 
-        In order of their time; file after file in a split bag. Raises DataError if a topic is
-        unknown, of several types or not in CDR, the bag damaged, or its list of messages wrong.
+        In the order of their time; file after file in a split bag. Raises DataError if a topic is
+        unknown, the bag damaged, or fewer messages can be read than it lists.
         """
-        if topics is None:
-            topics = [name for name in self._channels if self._is_readable(name)]
-        expected = {name: self.n_messages(name) for name in topics}
-        for name in expected:
-            if not self._is_readable(name):
-                raise DataError(
-                    f'{self.path}: topic {name} has messages of {self.topics[name]}; '
-                    'one topic must have one type, and be in CDR'
-                )
+        expected = {name: self.n_messages(name) for name in topics or self._in_cdr}
         found: Counter[str] = Counter()
-        for _, read in self._storages:
-            for name, time, raw in self._read(read(expected)) if expected else ():
-                found[name] += 1
-                yield name, time, raw
+        # Without topics rosbags would read all.
+        source = self._read(expected) if expected else iter(())
+        while True:
+            # Errors of the caller, raised at the yield, must not pass through here.
+            with self._naming():
+                message = next(source, None)
+            if message is None:
+                break
+            found[message[0]] += 1
+            yield message
         for name, n_messages in expected.items():
             if found[name] != n_messages:
                 raise DataError(
@@ -276,19 +216,6 @@ class BagReader(AbstractContextManager['BagReader']):
                     f'{found[name]} could be read; the bag is damaged, '
                     f'or its {METADATA_FILE} belongs to another one'
                 )
-
-    def _read(self, source: _Messages) -> _Messages:
-        """Messages of one file, unpacked; what goes wrong is a DataError."""
-        while True:
-            # Errors of the caller, raised at the yield, must not pass through here.
-            with reading(self.path):
-                if (message := next(source, None)) is None:
-                    return
-                name, time, raw = message
-                if self._is_packed:
-                    unpacker = require('zstandard', 'mcap').ZstdDecompressor()
-                    raw = unpacker.decompressobj().decompress(raw)
-            yield name, time, bytes(raw)
 
 
 class BagWriter:
@@ -333,14 +260,12 @@ class BagWriter:
         self._open.__exit__(*error)
 
     def add_topic(self, name: str, msgtype: str = POINT_CLOUD2) -> None:
-        """Declare a topic of a type of ROS 2 Jazzy, before its first message; once.
+        """Declare a topic of a type of ROS 2 Jazzy, before its first message.
 
         It is offered reliably: with best effort, large clouds get lost when played.
         """
         from rosbags import interfaces as ros
 
-        if name in self._connections:
-            raise DataError(f'{self.path}: topic {name} twice')
         forever = ros.QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
         history, liveliness = ros.QosHistory.KEEP_LAST, ros.QosLiveliness.AUTOMATIC
         kind = ros.QosReliability.RELIABLE, ros.QosDurability.VOLATILE

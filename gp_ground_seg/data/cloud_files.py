@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import DataError, GroundSegError, PointCloudError, in_one_line
+from gp_ground_seg.core.errors import DataError, PointCloudError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.pipeline.points import finite_points, objection_to_ranges
 from gp_ground_seg.data.clouds import (
@@ -32,7 +31,7 @@ from gp_ground_seg.data.clouds import (
     name_columns,
     scatter,
 )
-from gp_ground_seg.data.files import MAX_SCAN_BYTES, read_bytes
+from gp_ground_seg.data.files import MAX_SCAN_BYTES, naming, read_bytes
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
 
@@ -64,15 +63,13 @@ def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
     """
     found = np.load(io.BytesIO(data), allow_pickle=False)
     arrays: Columns = {TABLE: found} if isinstance(found, np.ndarray) else dict(found)
-    table = arrays.pop(_table_name(arrays), None)
-    if table is not None:
-        if table.dtype.names is None:
-            if table.ndim != 2 or table.shape[1] < 3:
-                raise PointCloudError(f'array of shape {table.shape}: must be (N, 3) or wider')
-            if table.shape[0] in (3, 4) and table.shape[1] >= _TRANSPOSED:
-                raise PointCloudError(f'array of shape {table.shape}: is transposed; save its .T')
-            table = name_columns(table)
-        arrays = {**scatter(table.ravel()), **arrays}
+    if coordinate_names(arrays)[0] not in arrays:
+        tables = [name for name, v in arrays.items() if v.dtype.names or v.shape[1:] >= (3,)]
+        if TABLE not in arrays and len(tables) != 1:
+            found = f'arrays {_shapes(arrays)}'
+            raise PointCloudError(f'{found}: must be x, y, z, or one array (N, 3) or wider')
+        table = arrays.pop(TABLE if TABLE in arrays else tables[0])
+        arrays = {**scatter(_points_of(table)), **arrays}
     x = arrays.get(coordinate_names(arrays)[0], np.empty(()))
     fields = {name: v for name, v in arrays.items() if x.ndim and v.shape[:1] == x.shape}
     if not fields:
@@ -80,23 +77,21 @@ def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
     return gather(fields), {name: v for name, v in arrays.items() if name not in fields}
 
 
+def _points_of(table: npt.NDArray[Any]) -> Fields:
+    """Structured array of a table, or of one that is structured."""
+    if table.dtype.names:
+        return table.ravel()
+    if table.ndim != 2 or table.shape[1] < 3:
+        raise PointCloudError(f'array of shape {table.shape}: must be (N, 3) or wider')
+    if table.shape[0] in (3, 4) and table.shape[1] >= _TRANSPOSED:
+        raise PointCloudError(f'array of shape {table.shape}: is transposed; save its .T')
+    return name_columns(table)
+
+
 def _shapes(arrays: Columns) -> str:
     """Name and shape of each array, cut where they are many."""
     found = ', '.join(f'{name} {values.shape}' for name, values in arrays.items()) or 'none'
     return textwrap.shorten(found, 200, placeholder=' ...')
-
-
-def _table_name(arrays: Columns) -> str:
-    """Name of the table: none beside an array x, `TABLE`, or the only one that can be a table."""
-    if coordinate_names(arrays)[0] in arrays:
-        return ''
-    if TABLE in arrays:
-        return TABLE
-    tables = [name for name, v in arrays.items() if v.dtype.names or v.shape[1:] >= (3,)]
-    if len(tables) != 1:
-        found = f'arrays {_shapes(arrays)}'
-        raise PointCloudError(f'{found}: must be x, y, z, or one array (N, 3) or wider')
-    return tables[0]
 
 
 def _encode_npy(cloud: Cloud) -> bytes:
@@ -157,7 +152,7 @@ def read_file(path: Path, columns: int = KITTI_COLUMNS) -> Cloud:
 
 def decode_file(path: Path, data: bytes) -> Cloud:
     """Cloud of the data of a file, of the format of `path`; DataError if it cannot be read."""
-    with _named(path, 'cannot be read'), np.errstate(all='ignore'):
+    with naming(path, f'cannot be read as {path.suffix}'), np.errstate(all='ignore'):
         fields, header = _READERS[path.suffix.lower()](data)
         check_numbers(count_numbers(fields.dtype))
         return cloud_of(fields, header)
@@ -168,7 +163,7 @@ def encode_file(path: Path, cloud: Cloud, columns: Columns) -> bytes:
 
     Its format is that of `path`, one of `WRITABLE`.
     """
-    with _named(path, 'cannot be written'), np.errstate(all='ignore'):
+    with naming(path, f'cannot be written as {path.suffix}'), np.errstate(all='ignore'):
         return _ENCODERS[path.suffix](cloud.join(columns))
 
 
@@ -189,20 +184,6 @@ def encode_output(path: Path, cloud: Cloud, result: Segmentation) -> bytes:
         return np.array(codes, dtype='<u4')[result.label].tobytes()
     values = {name: getattr(result, name).astype(np.float32) for name in _VALUES}
     return encode_file(path, cloud, {'label': result.label, **values})
-
-
-@contextmanager
-def _named(path: Path, what: str) -> Iterator[None]:
-    """Raise what goes wrong in the block as a DataError with the name of the file."""
-    try:
-        yield
-    except PointCloudError as error:
-        raise DataError(f'{path}: {error}') from error
-    except GroundSegError:
-        raise
-    except Exception as error:  # Of many types: ValueError, struct.error, zlib.error, ...
-        said = f'{type(error).__name__}: {in_one_line(error)}'
-        raise DataError(f'{path}: {what} as {path.suffix} ({said})') from error
 
 
 def read_scan(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[np.float32]:

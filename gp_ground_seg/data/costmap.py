@@ -23,6 +23,7 @@ from gp_ground_seg.core.frame import (
     Label,
     PointArray,
 )
+from gp_ground_seg.core.ground_model import segment_of
 from gp_ground_seg.core.parameters.config import ANY_HEIGHT, Config
 from gp_ground_seg.core.pipeline.sensor_pose import LEAST_COSINE
 from gp_ground_seg.core.result import Segmentation, cached_property
@@ -95,13 +96,8 @@ class SegmentedCloud:
     @cached_property
     def blocked(self) -> Places:
         """Places of the obstacles, and of edges of drops if ``output.max_step_down`` is not 0."""
-        obstacles, edges = self.places(self.is_obstacle), self.edges
-        if len(edges) == 0:
-            return obstacles
-        x, y = (
-            np.concatenate([a, b.astype(a.dtype)])
-            for a, b in zip(obstacles, self._in_plane(*edges.T), strict=True)
-        )
+        both = zip(self.places(self.is_obstacle), self._in_plane(*self.edges.T), strict=True)
+        x, y = (np.concatenate([a, b.astype(a.dtype)]) for a, b in both)
         return x, y
 
     @cached_property
@@ -185,10 +181,7 @@ def reach_of_model(surface: GroundSurface, heading: FloatArray, tolerance: float
     reach = np.append(0.0, surface.knots)[is_known.sum(axis=1)]
     middle = (np.arange(DIRECTIONS) + 0.5) * (2.0 * math.pi / DIRECTIONS) - math.pi
     x, y = heading @ np.stack([np.cos(middle), np.sin(middle)])
-    n_segments = len(reach)
-    turn = np.arctan2(y, x) / (2.0 * math.pi) + 0.5
-    segment = (turn * n_segments).astype(np.int64) % n_segments
-    return np.asarray(reach[segment], dtype=np.float32)
+    return np.asarray(reach[segment_of(x, y, len(reach))], dtype=np.float32)
 
 
 @np.errstate(over='ignore')

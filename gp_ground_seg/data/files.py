@@ -18,7 +18,13 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-from gp_ground_seg.core.errors import DataError, reason_of
+from gp_ground_seg.core.errors import (
+    DataError,
+    GroundSegError,
+    PointCloudError,
+    in_one_line,
+    reason_of,
+)
 from gp_ground_seg.data.bag_files import is_bag_folder
 
 MAX_SCAN_BYTES = 1 << 30  # of a file: 67 million points, a hundred times a dense scan
@@ -47,6 +53,25 @@ def changed_at(path: Path) -> int:
         return max(part.stat().st_mtime_ns for part in (path, *path.rglob('*')))
     except FileNotFoundError:
         return 0
+
+
+@contextmanager
+def naming(place: str | Path, what: str = '') -> Iterator[None]:
+    """Raise an error in the block as a DataError that names the place, a file or message.
+
+    Without `what`, only a PointCloudError; with it any error, which `what` introduces.
+    """
+    try:
+        yield
+    except PointCloudError as error:
+        raise DataError(f'{place}: {error}') from error
+    except GroundSegError:
+        raise
+    except Exception as error:  # Of many types: struct.error, zlib.error, sqlite3, lz4, ...
+        if not what:
+            raise
+        said = f'{type(error).__name__}: {in_one_line(error)}'
+        raise DataError(f'{place}: {what} ({said})') from error
 
 
 @contextmanager

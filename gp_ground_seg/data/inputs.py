@@ -10,7 +10,7 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
-from gp_ground_seg.core.errors import LOGGER, DataError, PointCloudError, shown
+from gp_ground_seg.core.errors import LOGGER, DataError, shown
 from gp_ground_seg.core.pipeline.points import take_points
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, METADATA_FILE
 from gp_ground_seg.data.bags import BagReader, decode_cloud
@@ -23,6 +23,7 @@ from gp_ground_seg.data.cloud_files import (
     read_file,
 )
 from gp_ground_seg.data.clouds import Cloud
+from gp_ground_seg.data.files import naming
 from gp_ground_seg.data.point_cloud2 import read_fields, read_xyz
 
 # Where the scans are in a sequence of SemanticKITTI or a root of nuScenes, and those sequences.
@@ -54,28 +55,26 @@ class Input:
     read: Callable[[], Cloud]
 
 
+@dataclass(frozen=True)
 class Inputs:
     """Clouds in their order: ``len()``, iteration and indices; read one at a time.
 
     A bag is read from its beginning each time; its clouds are best iterated over.
     """
 
-    def __init__(
-        self, path: Path, items: Sequence[Input], topic: str | None = None, n_messages: int = 0
-    ) -> None:
-        self.path = path
-        self.topic = topic  # of a bag, else None
-        self._items = items
-        self._n_messages = n_messages
+    path: Path
+    files: Sequence[Input]
+    topic: str | None = None  # of a bag
+    n_messages: int = 0  # on it
 
     def __len__(self) -> int:
         """Count the clouds."""
-        return self._n_messages or len(self._items)
+        return self.n_messages or len(self.files)
 
     def __iter__(self) -> Iterator[Input]:
         """Yield each cloud, not read yet."""
         if self.topic is None:
-            yield from self._items
+            yield from self.files
             return
         with BagReader(self.path) as bag:
             for k, (_, time, raw) in enumerate(bag.messages([self.topic])):
@@ -181,9 +180,7 @@ def _stem(path: Path) -> str:
 
 
 def _decode(raw: bytes, place: str) -> Cloud:
-    try:
+    with naming(place):
         message = decode_cloud(raw)
         # A cloud without points is one of a drive, and no error as a file of its own is.
         return Cloud(read_fields(message), take_points(read_xyz(message)))
-    except PointCloudError as error:
-        raise DataError(f'{place}: {error}') from error

@@ -16,11 +16,12 @@ the one behind goes up to the edge of a long ramp. And few of the steps go on as
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray
+from gp_ground_seg.core.ground_model import segment_of
 
 SECTORS = 360
 """Sectors of azimuth, counter-clockwise from -x, that steps are looked for in."""
@@ -30,35 +31,37 @@ NEAREST, FARTHEST, REACH = 0.3, 150.0, 20.0
 """Least and greatest range of a return, and greatest range of an edge [m]: beyond, rings are too
 far apart to tell a drop from a descent."""
 LEAST_SHARE = 0.4
-"""Least slope between the two returns of a step, over that of the line of sight: with less, the
-distance of the rings is larger than the part that the edge hides."""
+"""Least slope between the two returns of a step, as a share of the slope of the line of sight.
+With a smaller one, the rings are farther apart than the part that the edge hides."""
 MARGIN = 1.02
-"""Ratio of ranges within which returns may be of one place."""
+"""Largest ratio of the ranges of two returns that may be of one place."""
 
 WEAK = 0.7
-"""Share of the largest step that is enough where others beside it are larger: how deep a hole is
-seen depends on which ring just passes its edge."""
+"""A step of this share of the largest allowed one counts, if neighbouring steps are larger: how
+deep a hole is seen depends on which ring just passes its edge."""
 N_ROUGHNESS = 2.5
-"""Times the roughness of the ground that a fall is larger than the least one."""
+"""This many times the roughness of the ground is taken off the height of a step."""
 BEFORE, BEHIND, WIDTH = 0.4, 1.5, 3
 """Window of the ground before a step, as a share of its range; factor from the beginning of a
 window behind it to the end; sectors on each side that the windows take in."""
 WINDOWS = 2.0, 3.0, 4.5, 6.75, 10.0
 """Where windows about the sensor begin [m]: where it is rough, a step must be larger."""
 ON_SLOPE, MIN_DESCENT, MAX_ON_SLOPE = 0.35, 0.02, 0.2
-"""Slope of the ground before or behind a step, over that of the step, from which it is part of a
-descent; least descent to the next ring behind [m]; largest share of such steps in an edge."""
+"""A step is part of a descent if the ground before or behind it has at least this share of its
+slope; least descent to the next ring behind [m]; largest share of such steps in an edge."""
 NEXT_RINGS = 0.97, 0.85, 0.7
-"""Slopes of the line of sight at the returns that tell the slope behind, over that at the step."""
+"""The slope behind a step is that to the returns whose lines of sight have these shares of the
+slope of the line of sight at the step."""
 
 MAX_APART, SAME_EDGE = 3, 0.12
-"""Sectors from one step of an edge to the next, and what the edge may recede in a sector, over
-its range."""
+"""Most sectors from one step of an edge to the next, and the share of its range by which the edge
+may recede from sector to sector."""
 MIN_STEPS, MIN_WIDTH, MIN_STRONG = 3, 1.0, 0.25
-"""Least number of steps of an edge, its least width [m], and least share that are full ones."""
+"""Least number of steps of an edge, least width [m], and least share of steps that are larger than
+the largest allowed one."""
 PLANE_STD, SLOPE_STD, N_STD = 0.05, 0.15, 2.0
-"""Standard deviations of heights about a plane [m] and of its slope before any is seen, and how
-many of its own make a fall certain."""
+"""Standard deviations of heights about a plane [m] and, before any ground is seen, of its slope;
+a drop is certain if it is larger than this many standard deviations of the plane."""
 SAMPLES, SPACING = 8, 0.04
 """Points along an edge in a sector, and their distance along the line between two of them [m]: at
 `REACH` both are closer than the smallest cells of a map."""
@@ -100,17 +103,8 @@ class _Returns(NamedTuple):
     is_ground: BoolArray  # (n,)
     n_standing: IntArray  # (n + 1,) how many before each stand on the ground
 
-    @property
-    def z(self) -> FloatArray:
-        """Height, (n,) [m]."""
-        value: FloatArray = self.xyz[2]
-        return value
-
-    @property
-    def sight(self) -> FloatArray:
-        """Downward slope of the line of sight to each, (n,)."""
-        value: FloatArray = -self.xyz[2] / self.r
-        return value
+    z: FloatArray  # (n,) height [m]
+    sight: FloatArray  # (n,) downward slope of the line of sight
 
 
 class _Steps(NamedTuple):
@@ -124,13 +118,8 @@ class _Steps(NamedTuple):
 
     def where(self, kept: IntArray | BoolArray) -> _Steps:
         """Those of an index or a mask."""
-        return _Steps(
-            self.upper[kept],
-            self.lower[kept],
-            self.fall[kept],
-            self.before[:, kept],
-            self.is_on_slope[kept],
-        )
+        taken: list[Any] = [values[..., kept] for values in self]
+        return _Steps(*taken)
 
 
 def find_edges(
@@ -186,16 +175,16 @@ def _sort(xyz: FloatArray, is_ground: BoolArray, stands: BoolArray) -> _Returns:
     r = np.hypot(x, y)
     kept = np.flatnonzero((r > NEAREST) & (r < FARTHEST) & (z < 0.0) & (z > -FARTHEST))
     x, y, z, r = (values[kept] for values in (x, y, z, r))
-    turn = np.arctan2(y, x) / (2.0 * math.pi) + 0.5
-    sector = (turn * SECTORS).astype(np.int64) % SECTORS
+    sector = segment_of(x, y, SECTORS)
     level = ((np.arctan2(z, r) + 0.5 * math.pi) / LEVEL).astype(np.int64)
     key = sector * N_LEVELS + level
     # In a ring near to far, where the upper ground and the lower have both returns of it.
     order = np.lexsort((r, key))
     kept = kept[order]
     n_standing = np.concatenate([[0], np.cumsum(stands[kept])])
-    sorted_xyz = np.stack([x[order], y[order], z[order]])
-    return _Returns(key[order], sector[order], sorted_xyz, r[order], is_ground[kept], n_standing)
+    places, r, z = np.stack([x, y, z])[:, order], r[order], z[order]
+    ground = is_ground[kept]
+    return _Returns(key[order], sector[order], places, r, ground, n_standing, z, -z / r)
 
 
 def _falls(returns: _Returns, least: float) -> tuple[IntArray, FloatArray]:

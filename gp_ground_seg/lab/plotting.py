@@ -19,7 +19,7 @@ import numpy.typing as npt
 from gp_ground_seg.core.errors import ConfigError, in_thousands, require
 from gp_ground_seg.core.frame import OUTSIDE, BoolArray, FloatArray, Label
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.pipeline.points import check_points
+from gp_ground_seg.core.pipeline.points import take_points
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.files import staged_file, writing
 from gp_ground_seg.lab.scoring.metrics import (
@@ -39,34 +39,9 @@ COLOURS = {
     'false ground': '#AA3377',
 }
 """Colours of points by their label, and by what it is against the truth."""
-HEIGHTS = (-0.5, 3.0)
-"""Heights over the ground [m] from which to which `ramp_colours` go."""
-UNKNOWN = (0.5, 0.5, 0.5)
-"""Colour of a value that is not known."""
-
-# Lightness rises evenly from blue to yellow: with every common colour vision deficiency, and in
-# print, the order is seen.
-_RAMP = np.array(
-    [[0.02, 0.12, 0.40], [0.16, 0.30, 0.56], [0.36, 0.47, 0.60],
-     [0.58, 0.63, 0.56], [0.82, 0.79, 0.42], [1.00, 0.95, 0.50]]
-)  # fmt: skip
 DPI = 120
 GREEN, VIOLET = '#009E73', '#7A4FA3'
 """Of Okabe and Ito's palette, and one that differs from it with any colour vision."""
-
-
-def ramp_colours(values: FloatArray, low: float, high: float) -> FloatArray:
-    """Return colours from dark blue at `low` to pale yellow at `high`, low < high.
-
-    Values beyond take the colour of the end, NaN and infinity `UNKNOWN`. Returns red, green and
-    blue in [0, 1], (..., 3).
-    """
-    known = np.isfinite(values)
-    share = (np.where(known, values, low) - low) / (high - low)
-    stops = np.linspace(0.0, 1.0, len(_RAMP))
-    colours = np.stack([np.interp(share, stops, channel) for channel in _RAMP.T], axis=-1)
-    colours[~known] = UNKNOWN
-    return colours
 
 
 def new_figure(width: float, height: float) -> Any:
@@ -110,7 +85,7 @@ def plot_scan_view(
     where a point does not count, the errors too. `camera` is in the sensor frame [m]. In a PDF
     or SVG points are pixels.
     """
-    xyz = check_points(points)
+    xyz = take_points(points).astype(np.float64)
     check_lengths(len(xyz), label=label, truth=truth)
     said, layers = label_layers(label, truth)
     figure, foot = new_figure(WIDTH, HEIGHT + FOOT), FOOT / (HEIGHT + FOOT)
@@ -213,7 +188,7 @@ def plot_segment(
     labels, UNKNOWN where a point does not count. The axes end a little beyond the last candidate.
     The file `path` is replaced.
     """
-    z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
+    z = result.pose.level(take_points(points).astype(np.float64))[:, 2].astype(np.float64)
     check_lengths(len(z), result=result.label, truth=truth)
     views = [SegmentView(result, segment, z) for segment in segments]
     figure = new_figure(5.0 + 6.5 * len(views), 7.6)

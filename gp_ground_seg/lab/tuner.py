@@ -36,7 +36,7 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.inputs import Input, Inputs
 from gp_ground_seg.data.semantic_kitti import read_entries
-from gp_ground_seg.lab.plotting import CAMERA, COLOURS, GREEN, HEIGHTS, TARGET, ramp_colours
+from gp_ground_seg.lab.plotting import CAMERA, COLOURS, GREEN, TARGET
 from gp_ground_seg.lab.scoring.metrics import Labels, count_labels, label_ratios, true_labels
 from gp_ground_seg.lab.scoring.objects import Objects, count_objects, labelled_objects
 
@@ -49,8 +49,7 @@ LEGENDS = {
         name: COLOURS[name] for name in ('not scored', 'right', 'missed ground', 'false ground')
     },
 }
-RAMPS = {'height': HEIGHTS, 'p_ground': (0.0, 1.0)}
-"""Ends of the ramp from dark blue to yellow of the height over the ground [m], and of p_ground."""
+"""Ways to colour the points, and what their colours mean; changes have those of the class too."""
 
 
 class View(NamedTuple):
@@ -84,22 +83,19 @@ def read_view(item: Input, labels: str | None = None) -> View:
     return View(points, truth, objects)
 
 
-def point_colours(name: str, result: Segmentation, other: Labels | None = None) -> Colours:
-    """Colours of all points, (N, 3), by `name`.
+def point_colours(name: str, result: Segmentation, other: Labels) -> Colours:
+    """Colours of all points, (N, 3), by the `name` of a legend.
 
-    It is ``class`` or of `RAMPS`; ``errors`` against `other`, the truth; or ``changes``: the
-    class, and where it differs from `other`, what it is now.
+    It is ``errors`` against `other`, the truth; ``class``; or ``changes``: the class, and where
+    it differs from `other`, what it is now.
     """
     is_ground = result.label == Label.GROUND
-    if name in RAMPS:
-        shares = ramp_colours(getattr(result, name), *RAMPS[name])
-        return np.asarray((255.0 * shares).round(), dtype=np.uint8)
-    if name == 'errors' and other is not None:
+    if name == 'errors':
         kind = np.where(is_ground == (other == Label.GROUND), 1, np.where(is_ground, 3, 2))
         kind[other == Label.UNKNOWN] = 0
         return palette(name)[kind]
     colours = palette('class')[result.label]
-    if name == 'changes' and other is not None:
+    if name == 'changes':
         changed = result.label != other
         colours[changed] = palette(name)[np.where(is_ground[changed], 0, 1)]
     return colours
@@ -195,25 +191,17 @@ def box(content: str) -> str:
 
 def legend(names: Iterable[str]) -> str:
     """Return what the colours of points mean, as HTML."""
-    samples = ramp_colours(np.linspace(0.0, 1.0, 6), 0.0, 1.0)
-    stops = ','.join('rgb({:.0%} {:.0%} {:.0%})'.format(*rgb) for rgb in samples)
-    bar = f'<span style="background:linear-gradient(90deg,{stops})">{"&emsp;" * 5}</span>'
-    lines = []
-    for name in names:
-        if name in RAMPS:
-            low, high = RAMPS[name]
-            words = f'{low:g}&nbsp;{bar}&nbsp;{high:g}'
-        else:
-            words = ' '.join(
-                f'<nobr><span style="background:{colour}">&emsp;</span> {word}</nobr>'
-                for word, colour in LEGENDS[name].items()
-                if word != 'unknown'
-            )
-        lines.append(f'{name}{" [m]" * (name == "height")}: {words}')
-    return '<br>'.join(lines)
+    samples = {
+        name: ' '.join(
+            f'<nobr><span style="background:{colour}">&emsp;</span> {word}</nobr>'
+            for word, colour in LEGENDS[name].items()
+            if word != 'unknown'
+        )
+        for name in names
+    }
+    return '<br>'.join(f'{name}: {words}' for name, words in samples.items())
 
 
-COLOURINGS = ('changes', 'class', 'height', 'p_ground', 'errors')
 _USUAL = {'sensor.height': (0.2, 4.0), 'sensor.roll': (-0.3, 0.3), 'sensor.pitch': (-0.3, 0.3)}
 _NO_LABELS = ('frame', 'input', 'output', 'runtime', 'diagnostics')
 
@@ -267,7 +255,7 @@ class Tuner:
         self._said = gui.add_html(box('segmenting ...'))
         self._table, self._legend = gui.add_markdown(''), gui.add_html('')
         self._frame = gui.add_slider('frame', 0, max(last, 1), 1, frame, visible=last > 0)
-        self._colours = gui.add_dropdown('colours', COLOURINGS)
+        self._colours = gui.add_dropdown('colours', ('changes', 'class', 'errors'))
         self._watch(self._frame, self._colours)
         self._controls = {name: self._add_control(find_spec(name)) for name in names}
         self.add_button('compare with these values', self._compare)
@@ -338,10 +326,11 @@ class Tuner:
         """Segment a frame, and draw it in the colours of that name."""
         before, old_scores = self._before(number, self._reference)
         result, view = self._segment(number, config), self._view(number)
-        if name == 'errors' and view.truth is None:
-            name = 'changes'
+        other = view.truth if name == 'errors' else before
+        if other is None:
+            name, other = 'changes', before
         finite = result.label != Label.UNKNOWN
-        colours = point_colours(name, result, view.truth if name == 'errors' else before)[finite]
+        colours = point_colours(name, result, other)[finite]
         drawn = number, result.pose.roll, result.pose.pitch
         with self._server.atomic():
             if drawn == self._drawn:

@@ -11,12 +11,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from gp_ground_seg.core.errors import ConfigError, GroundSegError, reason_of, shown
+from gp_ground_seg.core.errors import ConfigError, GroundSegError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import ROS_PARAMETERS_KEY, read_yaml
 
 HIGHEST_DOMAIN = 232
-_MOST_KEYS = 10  # of a parameter file that are listed
 LOG_FOLDER = 'set ROS_LOG_DIR to a folder that the node may write to'
 NO_VALUE = ': a value is null or an empty list, which ROS does not read; no input.crop_box is none'
 
@@ -69,18 +68,13 @@ def _check_surroundings(words: Sequence[str]) -> None:
     for path in _parameter_files(words):
         try:
             document = read_yaml(path)
-        except OSError as error:
-            raise ConfigError(f'{path}: {reason_of(error)}') from error
-        except (UnicodeDecodeError, ConfigError) as error:
+        except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error
         if document and not _node_keys(document):
-            hint = 'gp-ground-seg config dump writes a file of the form of ROS'
-            if not Config.problems_of_file(path):
-                hint = (
-                    'bare groups are good for --config; for the node: gp-ground-seg config dump '
-                    '--config FILE > ros.yaml'
-                )
-            raise ConfigError(f'{path}: no {ROS_PARAMETERS_KEY}; {hint}')
+            raise ConfigError(
+                f'{path}: no {ROS_PARAMETERS_KEY}, which the node needs; from bare groups: '
+                'gp-ground-seg config dump --config FILE > ros.yaml'
+            )
 
 
 def _parameter_files(words: Sequence[str]) -> list[str]:
@@ -100,14 +94,13 @@ def unused_files(words: Sequence[str], node_name: str) -> list[str]:
     lines = []
     for path in _parameter_files(words):
         keys: list[str] = []
-        with contextlib.suppress(OSError, ConfigError):  # it was read before, and may be gone
+        with contextlib.suppress(ConfigError):  # it was read before, and may be gone
             keys = _node_keys(read_yaml(path))
         if keys and not any(_is_of_node(key, node_name) for key in keys):
-            more = [f'{len(keys) - _MOST_KEYS} more'] if len(keys) > _MOST_KEYS else []
             lines.append(
                 f'{shown(path)}: not used: its parameters are those of '
-                f'{", ".join([*keys[:_MOST_KEYS], *more])}, and this node is '
-                f'{node_name}; a key of /** is for every node'
+                f'{", ".join(keys)}, and this node is {node_name}; '
+                'a key of /** is for every node'
             )
     return lines
 

@@ -1,4 +1,4 @@
-"""Four tasks on /diagnostics; ``now`` is on a steady clock [s]."""
+"""The four tasks on /diagnostics; ``now`` is a time of a steady clock [s]."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from gp_ground_seg.ros.input import STEADY_CLOCK, seconds_of
 
 RATE_WINDOW = 10.0  # time over which rates are taken [s]
 FIRST_LOG, LOG_PERIOD = 10.0, 60.0
-"""Time from the first cloud to the line of the log that says that the node works, and from there
-to the next one, at least [s]."""
+"""Time from the first cloud to the first line of the log on the clouds so far, and from a line to
+the next [s]."""
 CLOUD_WINDOW = 100  # clouds over which the median of the latency is taken
 Level = IntEnum('Level', 'OK WARN ERROR STALE', start=0)
 """Severity, with the values of ``diagnostic_msgs/DiagnosticStatus``."""
@@ -73,9 +73,9 @@ class InputFacts(NamedTuple):
     qos: str
     n_publishers: int
     ros_time: float  # by the clock of the node [s]
-    is_simulated: bool = False  # that clock
-    fault: str = ''  # of the way clouds are received
-    idle: str = ''  # why none are wanted
+    is_simulated: bool = False  # whether that clock is /clock
+    fault: str = ''  # in the way clouds are received
+    idle: str = ''  # why no clouds are wanted
 
 
 class InputTask:
@@ -206,7 +206,7 @@ class ProcessingTask:
 
 
 def model_status(scan: Segmentation | None, n_learned: int) -> Status:
-    """Judge the newest scan; from `n_learned` scans hyper-parameters were learned."""
+    """Judge the newest scan; `n_learned` scans had their hyper-parameters learned."""
     if scan is None:
         return Status('model', Level.OK, 'no cloud segmented yet', {})
     fit, label = scan.fit, scan.label
@@ -235,7 +235,7 @@ def model_status(scan: Segmentation | None, n_learned: int) -> Status:
 
 
 def _faults_of(scan: Segmentation) -> list[str]:
-    """Return doubts of the pose that was used; without any, why there is no good model."""
+    """Return what is wrong with the pose that was used; if nothing is, with the model."""
     pose = scan.pose
     faults = [*pose.contradictions]
     if scan.label.any():  # an empty cloud shows nothing of the pose

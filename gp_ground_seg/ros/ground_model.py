@@ -13,7 +13,6 @@ from __future__ import annotations
 import numpy as np
 from sensor_msgs.msg import PointCloud2, PointField
 
-from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.point_cloud2 import message_data, read_columns
@@ -63,14 +62,4 @@ def read_ground_model(cloud: PointCloud2) -> GroundModel:
     `cloud` is a message of rclpy, or one with the same attributes, such as that of rosbags. Raises
     a PointCloudError if a field is missing, or if the points are not such a grid.
     """
-    columns = read_columns(cloud, FIELDS)
-    if columns['x'].size == 0:
-        raise PointCloudError('ground model of no points: must have at least 1 segment')
-    return GroundModel.from_knot_points(
-        np.stack([columns[axis] for axis in 'xyz'], axis=-1),
-        columns['range'][0],
-        columns['std'],
-        columns['length_scale'],
-        float(columns['roll'][0, 0]),
-        float(columns['pitch'][0, 0]),
-    )
+    return GroundModel.from_columns(read_columns(cloud, FIELDS))

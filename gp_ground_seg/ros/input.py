@@ -19,12 +19,12 @@ from sensor_msgs.msg import PointCloud2
 from gp_ground_seg.core.errors import ConfigError
 
 CLOUD_TYPE = 'sensor_msgs/msg/PointCloud2'
-INPUT_DEPTH = 1  # clouds that may wait to be processed: the newest, which is worth most
+INPUT_DEPTH = 1  # clouds that may wait to be processed: the newest only
 MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
 LARGE_CLOUD = 500_000  # size up to which stock Fast DDS loses no best-effort cloud [bytes]
-NEAR = 1000  # gap in the numbers of several publishers up to which it counts as a loss
-JUMP_TOLERANCE = 0.5  # stamps of several sensors on one topic may be that much out of order [s]
+NEAR = 1000  # with several publishers, a larger gap in the numbers is no loss
+JUMP_TOLERANCE = 0.5  # stamps of several sensors on a topic may be so far out of order [s]
 NOTHING_ARRIVES = (
     'qos_overrides asks for reliable, and a publisher offers best effort: nothing arrives from it'
 )
@@ -49,9 +49,9 @@ class SequenceGaps:
     """Counts messages that did not arrive, of publishers that number theirs 1, 2, 3 ... each.
 
     They were lost on the way, or overwritten in a full queue while the node was busy. rclpy does
-    not say who has sent a message: a number counts as the next of the publisher whose last number
-    is the nearest below. A loss of one publisher may so be counted later, for another one. The
-    first message of a publisher is not counted as a gap.
+    not name the publisher of a message: a number is assigned to the publisher whose last number is
+    the nearest below it. So a loss may be counted late, with a message of another publisher. The
+    first message of a publisher does not count as a gap.
     """
 
     def __init__(self) -> None:
@@ -102,12 +102,12 @@ class CloudSubscription:
     gets nothing from a best-effort LiDAR driver. ROS decides between them when a subscription with
     `ReliabilityPolicy.BEST_AVAILABLE` is made: `review` makes it, at the start and anew when the
     publishers change. A reliability given in ``qos_overrides`` is kept for any publisher.
-    `why_idle` says why no clouds are wanted: while it says something, there is no subscription.
+    `why_idle` returns why no clouds are wanted: while it returns a text, there is no subscription.
     `on_jump` is called as by `TimeJumps`.
     """
 
     idle = ''
-    """Why no clouds are wanted, at the last review."""
+    """Why no clouds were wanted at the last review; empty if they were."""
     _subscription: Any = None
     _reliability = ReliabilityPolicy.UNKNOWN
     _fault_of_types = _fault_of_size = ''
@@ -147,7 +147,7 @@ class CloudSubscription:
 
     @property
     def n_publishers(self) -> int:
-        """Publishers at the last look."""
+        """Number of publishers of clouds, when last counted."""
         return len(self._offered)
 
     @property
@@ -157,20 +157,6 @@ class CloudSubscription:
         is_pinned = self._is_pinned and self._reliability == ReliabilityPolicy.RELIABLE
         other = NOTHING_ARRIVES if is_pinned and is_refused else self._fault_of_size
         return '; '.join(filter(None, (self._fault_of_types, other)))
-
-    def _create(self) -> None:
-        self._subscription = self._node.create_subscription(
-            PointCloud2,
-            self._unresolved_topic,
-            self._receive,
-            self._profile,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible),
-        )
-
-    def _end(self) -> None:
-        self._node.destroy_subscription(self._subscription)
-        self._subscription = None
-        self._gaps.reset()
 
     def _receive(self, cloud: PointCloud2, info: dict[str, Any]) -> None:
         if not self._offered:
@@ -201,7 +187,7 @@ class CloudSubscription:
         self._review_soon.trigger()
 
     def _look_at_publishers(self) -> bool:
-        """Take note of the publishers; return whether they are others than at the last look."""
+        """Note the publishers; return whether they have changed since the last call."""
         before, foreign = self._offered.keys(), self._foreign
         entries = self._node.get_publishers_info_by_topic(self.topic)
         self._foreign = {entry.topic_type for entry in entries} - {CLOUD_TYPE}
@@ -223,27 +209,31 @@ class CloudSubscription:
             self._gaps.reset()
         return is_changed
 
-    def _wanted_reliability(self) -> ReliabilityPolicy:
-        """Return what is pinned, or what BEST_AVAILABLE is for the publishers of the last look."""
-        if self._is_pinned:
-            return self._profile.reliability
-        is_any = ReliabilityPolicy.BEST_EFFORT in self._offered.values()
-        return ReliabilityPolicy.BEST_EFFORT if is_any else ReliabilityPolicy.RELIABLE
-
     def review(self) -> None:
         """Subscribe as the publishers offer, or not at all, as clouds are wanted now; log it."""
         self._look_at_publishers()
-        wanted = self._wanted_reliability()
+        wanted, offered = self._profile.reliability, self._offered.values()
+        if not self._is_pinned:  # what BEST_AVAILABLE is for these publishers
+            is_any = ReliabilityPolicy.BEST_EFFORT in offered
+            wanted = ReliabilityPolicy.BEST_EFFORT if is_any else ReliabilityPolicy.RELIABLE
         self.idle = self._why_idle()
         is_listening = self._subscription is not None
         if is_listening != bool(self.idle) and wanted == self._reliability:
             return
         if is_listening:
-            self._end()
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = None
+            self._gaps.reset()
         self._reliability, self._fault_of_size = wanted, ''
         words = f'not listening to {self.topic}: {self.idle}'
         if not self.idle:
-            self._create()
+            self._subscription = self._node.create_subscription(
+                PointCloud2,
+                self._unresolved_topic,
+                self._receive,
+                self._profile,
+                event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible),
+            )
             words = f'listening to {self.topic} ({self.qos_words})'
         self._node.get_logger().info(words)
 
@@ -251,12 +241,6 @@ class CloudSubscription:
 def seconds_of(stamp: TimeMessage) -> float:
     """Return the time of a header [s]."""
     return float(stamp.sec + 1e-9 * stamp.nanosec)
-
-
-def clock_fault(clock: Clock) -> str:
-    """Return what is wrong with the `clock` of a node; empty if nothing."""
-    is_waiting = clock.ros_time_is_active and clock.now().nanoseconds == 0
-    return NO_TIME if is_waiting else ''
 
 
 class TimeJumps:
@@ -270,7 +254,7 @@ class TimeJumps:
         threshold = JumpThreshold(
             min_forward=None, min_backward=Duration(seconds=-JUMP_TOLERANCE), on_clock_change=False
         )
-        # The callback lives as long as its handle.
+        # The callback is called as long as this handle lives.
         self._handle = node.get_clock().create_jump_callback(
             threshold, post_callback=self._clock_jumped
         )

@@ -36,7 +36,7 @@ from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.ros.arguments import initialize, start_errors, unused_files, with_file
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts, kept_height
-from gp_ground_seg.ros.input import STEADY_CLOCK, THROTTLED, CloudSubscription, clock_fault
+from gp_ground_seg.ros.input import NO_TIME, STEADY_CLOCK, THROTTLED, CloudSubscription
 from gp_ground_seg.ros.loader import CHANGED, FOLLOWS, STAYS, BackendLoader
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
@@ -46,13 +46,14 @@ from gp_ground_seg.ros.transforms import (
     FrameListener,
     KeptPose,
     check_tf2,
-    is_listening,
+    find_module,
+    is_tf_used,
 )
 
 # Time between heartbeats [s], the same as in Nav2's own nodes: the manager connects after the
 # first, and waits half of its bond_timeout for one.
 BOND_PERIOD = 0.1
-BOND_TIMEOUT = 4.0  # without one until the node is taken for dead [s]: the manager's own default
+BOND_TIMEOUT = 4.0  # without a heartbeat the node counts as dead [s]: the manager's default
 BOND_DEPTH = 5
 LAST_WORDS = Duration(seconds=0.5)  # longest wait until the end of a bond is delivered
 NO_BOND = (
@@ -109,7 +110,7 @@ class GroundSegmentationNode(ConfiguredNode):
     def _on_cloud(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
         """Read a cloud, segment it, publish the result, and note it; or say why it is refused.
 
-        It came at the time `arrival` of ``time.monotonic`` [s], and `n_lost` before it did not.
+        It came at the time `arrival` of ``time.monotonic`` [s]; `n_lost` before it were lost.
         """
         if self._input.idle:
             return  # it has waited for TF or IMU, and is not wanted any more
@@ -191,16 +192,15 @@ class GroundSegmentationNode(ConfiguredNode):
         if choose_backend(self.config.runtime.backend) == 'numba':
             self._segmenter.use_backend(backend)
             self.get_logger().info(f'{CHANGED}, after {self._loader.seconds:.1f} s')
-        # Where `runtime` has changed meanwhile, this makes another backend.
+        # Makes another backend if `runtime` has changed meanwhile.
         self._segmenter.configure(self.config)
 
     def _follow_frames(self, config: Config) -> None:
         """Listen to TF and IMU while the parameters ask for it; clouds wait for them then."""
-        before = self._frames.config if self._frames else Config()
-        if self._frames is not None and config.frame != before.frame:
+        if self._frames is not None and config.frame != self._frames.config.frame:
             self._frames.close()
             self._frames = None
-        if self._frames is None and is_listening(config):
+        if self._frames is None and (config.frame.level == 'imu' or is_tf_used(config)):
             self._frames = FrameListener(self, config, self._on_cloud)
         self._input.callback = self._frames.hold if self._frames else self._on_cloud
 
@@ -212,7 +212,7 @@ class GroundSegmentationNode(ConfiguredNode):
     def destroy_node(self) -> None:
         """Free what the node holds."""
         self._loader.stop()
-        # The network before the thread of the loader: it may end late.
+        # Before the thread of the loader, which may end late.
         super().destroy_node()
         self._loader.close()
         self._library_log.close()
@@ -227,12 +227,13 @@ class GroundSegmentationNode(ConfiguredNode):
         clock = self.get_clock()
         source, now = self._input, 1e-9 * clock.now().nanoseconds
         is_simulated = clock.ros_time_is_active
-        if no_time := clock_fault(clock):
-            self.get_logger().warning(no_time, once=True)
-        faults = '; '.join(filter(None, (source.fault, no_time)))
+        faults = [source.fault] if source.fault else []
+        if is_simulated and not now:
+            self.get_logger().warning(NO_TIME, once=True)
+            faults.append(NO_TIME)
         facts = InputFacts(
-            source.topic, source.qos_words, source.n_publishers, now, is_simulated, faults,
-            source.idle,
+            source.topic, source.qos_words, source.n_publishers, now, is_simulated,
+            '; '.join(faults), source.idle,
         )  # fmt: skip
         return facts, self._outputs.n_subscribers()
 
@@ -259,7 +260,7 @@ class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[m
                 service.callback = partial(self._answer, service.callback)
 
     def _answer(self, change: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
-        """Do what rclpy's callback `change` does; refuse a transition that there is not."""
+        """Do what rclpy's callback `change` does; refuse a transition that is impossible."""
         try:
             return change(request, response)
         except RuntimeError:  # of rcl
@@ -293,8 +294,8 @@ class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[m
         if self._heartbeat is not None:
             self._heartbeat.stop()
             self._heartbeat = None
-        if is_active and (message := find_message()) is not None:
-            self._heartbeat = Heartbeat(self, message)
+        if is_active and (bond := find_module('bond.msg')) is not None:
+            self._heartbeat = Heartbeat(self, bond.Status)
         elif is_active:
             self.get_logger().info(NO_BOND)
         return TransitionCallbackReturn.SUCCESS
@@ -317,25 +318,16 @@ class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[m
     on_shutdown = on_error = on_cleanup
 
 
-def find_message() -> Any:
-    """Return the type bond/msg/Status, None where the package is not installed."""
-    try:
-        from bond.msg import Status
-    except ImportError:
-        return None
-    return Status
-
-
 class Heartbeat:
-    """Says on ``bond`` that a node lives, from its making until `stop`, which says the end of it.
+    """Publishes on ``bond`` that `node` is alive, until `stop`, which says that it ends.
 
-    `message` is the type bond/msg/Status. The name of the node is the name of the bond, as Nav2's
-    own nodes have it. It beats in the executor: a node that hangs is not alive.
+    `message` is the type bond/msg/Status. The bond has the name of the node, as with Nav2's own
+    nodes. It is published by the executor of the node: a node that hangs sends no heartbeat.
     """
 
     def __init__(self, node: Node, message: Any) -> None:
         self._node, self._message = node, message
-        # Each bond is a new one: the manager takes an old one for dead.
+        # A new name each time: the manager takes a bond that has ended for dead.
         self._instance = str(uuid.uuid4())
         self._publisher = node.create_publisher(message, 'bond', BOND_DEPTH)
         self._timer = node.create_timer(BOND_PERIOD, self._beat, clock=STEADY_CLOCK)
@@ -355,7 +347,7 @@ class Heartbeat:
     def stop(self) -> None:
         """Say that the bond ends on purpose."""
         self._beat(False)
-        # A publisher that is destroyed takes with it what is not yet delivered.
+        # What is not yet delivered is lost when the publisher is destroyed.
         self._publisher.wait_for_all_acked(LAST_WORDS)
         self._node.destroy_timer(self._timer)
         self._node.destroy_publisher(self._publisher)

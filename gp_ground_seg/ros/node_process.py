@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import secrets
 import subprocess
-import time
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -28,8 +27,7 @@ from gp_ground_seg.ros.session import (
 INPUT, GROUND, OBSTACLES = 'points', 'ground', 'obstacles'  # topics of the node
 OUTPUTS = (GROUND, OBSTACLES)
 DEPTH = 10  # clouds that may wait to be sent, or taken
-PATIENCE = 60.0  # longest time that a cloud may take [s]
-START_TIMEOUT = 300.0  # time the node has to start, on a slow machine that does much else [s]
+LONGEST_WAIT = 120.0  # for an answer, on a slow machine that does much else [s]
 
 _RUN = f'from {__name__} import run_node; sys.exit(run_node(sys.argv[1:]))'
 
@@ -121,33 +119,27 @@ class Link:
         twice as long to answer: it shares the processor with its compiler, and each cloud that is
         sent again is work for it.
         """
-        first = with_stamp(cloud, (1, 0))
-        patience, end = 0.5, time.monotonic() + START_TIMEOUT
-        while self._ask(first, patience) is None:
-            if time.monotonic() > end:
-                raise GroundSegError(_silence(START_TIMEOUT))
+        first, patience = with_stamp(cloud, (1, 0)), 0.5
+        while patience < LONGEST_WAIT and not self._is_answered(first, patience):
             patience *= 2.0
+        self.ask(first)
 
     def ask(self, cloud: CloudMessage) -> dict[str, CloudMessage]:
         """Send a cloud; return what the node makes of it, by topic."""
-        if (found := self._ask(cloud, PATIENCE)) is None:
-            raise GroundSegError(_silence(PATIENCE))
-        return found
+        if not self._is_answered(cloud, LONGEST_WAIT):
+            topics = ' and '.join(OUTPUTS)
+            raise GroundSegError(f'no answer on {topics} within {LONGEST_WAIT:g} s')
+        return self._back.pop(stamp_of(cloud))
 
-    def _ask(self, cloud: CloudMessage, patience: float) -> dict[str, CloudMessage] | None:
+    def _is_answered(self, cloud: CloudMessage, patience: float) -> bool:
         self._publisher.publish(encode_cloud(cloud))
-        stamp = stamp_of(cloud)
 
         def is_back() -> bool:
             self._node.check()
-            return len(self._back.get(stamp, ())) == len(OUTPUTS)
+            return len(self._back.get(stamp_of(cloud), ())) == len(OUTPUTS)
 
-        return self._back.pop(stamp) if self._session.wait_for(is_back, patience) else None
+        return self._session.wait_for(is_back, patience)
 
     def _take(self, topic: str, raw: bytes) -> None:
         cloud = decode_cloud(raw)
         self._back.setdefault(stamp_of(cloud), {})[topic] = cloud
-
-
-def _silence(seconds: float) -> str:
-    return f'no answer on {" and ".join(OUTPUTS)} within {seconds:g} s'

@@ -36,7 +36,7 @@ LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
 OUTPUT_DEPTH = 20  # messages kept: Fast DDS may send a lost fragment again after 0.7 s only
 LONGEST_PERIOD = 1.0
-"""Time between two clouds from which it says nothing of the sensor [s]: clouds are missing."""
+"""Time between two clouds [s] from which on some are missing: ``scan_time`` is 0 then."""
 
 
 class Output(NamedTuple):
@@ -121,13 +121,10 @@ def _selected(segmented: SegmentedCloud, chosen: BoolArray) -> PointCloud2:
     return select_points(segmented.cloud, chosen, message_bytes, are_finite=True)
 
 
-LABELLED = Output(
-    '~/labeled', PointCloud2, lambda s: labelled_cloud(s.cloud, s.segmentation), True
-)
 OUTPUTS = (
     Output('ground', PointCloud2, lambda s: _selected(s, s.is_ground), False),
     Output('obstacles', PointCloud2, lambda s: _selected(s, s.is_obstacle), False),
-    LABELLED,
+    Output('~/labeled', PointCloud2, lambda s: labelled_cloud(s.cloud, s.segmentation), True),
     Output(
         '~/ground_model', PointCloud2, lambda s: ground_model_cloud(s.cloud, s.segmentation), True
     ),
@@ -142,8 +139,6 @@ class OutputPublishers:
     _stamp = math.inf  # of the last cloud [s]
 
     def __init__(self, node: Node) -> None:
-        self._logger = node.get_logger()
-        self._renamed: dict[str, str] = {}
         options = {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
         self._publishers = [
             (o, node.create_publisher(o.message_type, o.topic, OUTPUT_DEPTH, **options))
@@ -159,25 +154,12 @@ class OutputPublishers:
         seconds = seconds_of(segmented.cloud.header.stamp)
         period, self._stamp = seconds - self._stamp, seconds
         messages = [
-            (output, publisher, output.build(segmented))
+            (publisher, output.build(segmented))
             for output, publisher in self._publishers
             if not output.is_optional or publisher.get_subscription_count() > 0
         ]
-        for output, publisher, message in messages:
-            if output is LABELLED:
-                self._warn_of_renamed(segmented.cloud)
+        for publisher, message in messages:
             if isinstance(message, LaserScan):
                 message.scan_time = period if 0.0 < period < LONGEST_PERIOD else 0.0
             publisher.publish(message)
-        return [publisher.topic_name for _, publisher, _ in messages]
-
-    def _warn_of_renamed(self, cloud: PointCloud2) -> None:
-        names = labelled_names(field.name for field in cloud.fields)
-        renamed = {field: name for field, name in names.items() if name != field}
-        if renamed != self._renamed:
-            self._renamed = renamed
-            for field, name in renamed.items():
-                self._logger.warning(
-                    f'the input has a field {field} already, which is kept; in ~/labeled ours is '
-                    f'{name}'
-                )
+        return [publisher.topic_name for publisher, _ in messages]

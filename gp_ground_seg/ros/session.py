@@ -56,11 +56,11 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals(numbers: Iterable[signal.Signals] = _STOPS) -> Iterator[StopRequest]:
-    """Have the signals `numbers` within the block noted in the `StopRequest` that it yields.
+    """Yield a `StopRequest` that notes whether one of the signals `numbers` comes in the block.
 
     After the first signal all of them stay ignored: a terminal and ``ros2 launch`` both send one,
-    and the second must not break the clean-up. Only the main thread can do that; in another one
-    nothing is changed.
+    and the second must not break the clean-up. In a thread that is not the main one, signals are
+    left as they are.
     """
     request = StopRequest()
     is_main = threading.current_thread() is threading.main_thread()
@@ -87,7 +87,7 @@ class Session:
         self._executor.add_node(node)
 
     def check(self) -> None:
-        """Do nothing else; long loops call it."""
+        """Raise it; for loops that wait for nothing."""
         if self._stop.made:
             raise KeyboardInterrupt
 
@@ -148,7 +148,7 @@ def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
 
     context = Context()
     initialize([name, *ros_args], context)
-    # What is ignored on purpose, as by nohup, stays so.
+    # A signal that is ignored on purpose, as by nohup, stays ignored.
     heeded = [n for n in (*_STOPS, signal.SIGHUP) if signal.getsignal(n) != signal.SIG_IGN]
     try:
         with start_errors():
@@ -167,9 +167,10 @@ def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
 
 @contextmanager
 def large_cloud_transport() -> Iterator[None]:
-    """Name the Fast DDS profile for large clouds to ROS, first used in the block, and children.
+    """Set the Fast DDS profile for large clouds in the environment, unless the user has set one.
 
-    Unless the user has chosen one. Without it, clouds above 0.5 MB lose pieces on the way.
+    ROS reads it when it is first used, in the block; so do child processes. Without the profile,
+    parts of clouds above 0.5 MB are lost.
     """
     profile = _find_profile()
     is_chosen = any(os.environ.get(name) for name in _TRANSPORT_VARIABLES)

@@ -24,25 +24,25 @@ from gp_ground_seg.core.pipeline.points import angles_of
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.ros.input import STEADY_CLOCK, OnCloud, seconds_of
 
-KEPT_JUMP = 1.0  # jump back up to which transforms are kept: a late stamp, no other run [s]
+KEPT_JUMP = 1.0  # after a longer jump back in time, transforms are forgotten [s]
 MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]
-REVIEW_PERIOD = 0.005  # time between two looks at whether they have come [s]
+REVIEW_PERIOD = 0.005  # time between two checks of whether they have come [s]
 IMU_TOLERANCE = 0.05  # longest time between a cloud and its orientation [s]
-IMU_DEPTH = 400  # messages kept: of the wait and of the previous cloud, at 1 kHz
+IMU_DEPTH = 400  # messages kept: those of 0.4 s at 1 kHz
 INSTALL_TF2 = 'sudo apt install ros-jazzy-tf2-ros-py'
 
 
-def find_tf2() -> Any:
-    """Return the module tf2_ros, None if it is not installed."""
+def find_module(name: str) -> Any:
+    """Return a module of ROS that is not a dependency, None if it is not installed."""
     try:
-        return importlib.import_module('tf2_ros')
+        return importlib.import_module(name)
     except ImportError:
         return None
 
 
 def check_tf2(config: Config) -> None:
     """Raise a MissingDependencyError if `config` asks for TF and tf2_ros is not installed."""
-    if not is_tf_used(config) or find_tf2() is not None:
+    if not is_tf_used(config) or find_module('tf2_ros') is not None:
         return
     asked, instead = 'frame.level = tf', 'frame.level = sensor with sensor.roll and sensor.pitch'
     if config.frame.sensor != NO_FRAME:
@@ -85,13 +85,8 @@ def is_tf_used(config: Config) -> bool:
     return config.frame.level == 'tf' or config.frame.sensor != NO_FRAME
 
 
-def is_listening(config: Config) -> bool:
-    """Return whether a cloud needs a `FrameListener`."""
-    return config.frame.level == 'imu' or is_tf_used(config)
-
-
 class CloudFrames(NamedTuple):
-    """What TF or an IMU say of the frame of a cloud; None for what the parameters do not ask."""
+    """Tilt, place and base of the sensor by TF or IMU; None where the parameters ask for none."""
 
     tilt: tuple[float, float] | None = None  # roll and pitch of the sensor [rad]
     origin: tuple[float, float, float] | None = None  # place of the sensor in it [m]
@@ -113,12 +108,10 @@ class ImuListener:
     def _take(self, message: Imu) -> None:
         self._messages.append(message)
 
-    def frame_at(self, header: Header) -> str | None:
-        """Return the frame of the IMU; None if it has sent nothing as new as a cloud."""
-        newest = self._messages[-1].header if self._messages else None
-        if newest is None or seconds_of(newest.stamp) < seconds_of(header.stamp):
-            return None
-        return str(newest.frame_id)
+    def reaches(self, header: Header) -> bool:
+        """Return whether it has sent something as new as a cloud."""
+        newest = [seconds_of(message.header.stamp) for message in self._messages][-1:]
+        return bool(newest) and newest[0] >= seconds_of(header.stamp)
 
     def at(self, header: Header) -> Imu:
         """Return the message nearest in time to a cloud; raise a PointCloudError without one."""
@@ -145,18 +138,22 @@ class ImuListener:
 
 
 class FrameListener:
-    """Listens to TF and to an IMU in the executor of `node`, for what `config` asks.
+    """Listens to TF and to an IMU, as `config` asks, in the executor of `node`.
 
-    Clouds come to `hold`, which passes each on to `use`, in their order, as soon as all that it
-    needs is known at its stamp, or after `MAX_WAIT`. TF and IMU come to the same executor: a
-    callback cannot wait for them.
+    `hold` takes clouds and passes them to `use` in their order: each as soon as transform and
+    orientation at its stamp are known, or after `MAX_WAIT`. It does not block: the messages of TF
+    and IMU come to the same executor.
     """
 
     def __init__(self, node: Node, config: Config, use: OnCloud) -> None:
         self.config = config
         self._imu = ImuListener(node) if config.frame.level == 'imu' else None
-        self._tf2_ros = find_tf2()
+        self._tf2_ros = find_module('tf2_ros')
+        self._not_yet: Any = ()  # what TF raises
+        self._too_late: Any = ()
         if self._tf2_ros is not None:
+            self._not_yet = self._tf2_ros.TransformException
+            self._too_late = self._tf2_ros.ExtrapolationException
             # Without the node: given one, the buffer clears itself at jumps of the node's clock,
             # and in some releases raises an error there that ends the executor. See `time_jumped`.
             self._buffer = self._tf2_ros.Buffer()
@@ -167,7 +164,7 @@ class FrameListener:
         self._timer.cancel()
 
     def hold(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
-        """Keep a cloud until all that it needs is known."""
+        """Keep a cloud until its transform and orientation are known."""
         use = partial(self._use, cloud, arrival, n_lost)
         self._waiting.append((time.monotonic() + MAX_WAIT, cloud.header, use))
         self._review()
@@ -183,69 +180,59 @@ class FrameListener:
         self._timer.cancel()
 
     def _is_known(self, header: Header) -> bool:
-        wanted = {self.config.frame.sensor}
-        if self.config.frame.level == 'tf':
-            wanted.add(self.config.frame.base)
-        if self._imu is not None:
-            frame = self._imu.frame_at(header)
-            if frame is None:
-                return False
-            wanted.add(frame)
-        if self._tf2_ros is None:
-            return True
-        try:
-            for frame in wanted - {NO_FRAME, header.frame_id}:
-                self._exact(frame, header.frame_id, header)
-        except self._tf2_ros.TransformException:
+        """Return whether `look_up` need not wait: all is known at the stamp, or it raises."""
+        if self._imu is not None and not self._imu.reaches(header):
             return False
-        except ValueError:
-            return True  # no such time: the cloud is refused with the reason
+        try:
+            self._look_up(header, self._exact)
+        except self._not_yet:
+            return False
+        except (PointCloudError, ValueError):
+            return True  # the cloud is refused with the reason
         return True
 
     def look_up(self, header: Header) -> CloudFrames:
-        """Return what is known of the frame of a cloud.
+        """Return tilt and place of the sensor at the stamp of a cloud, as the parameters ask.
 
-        Tilt and place of the sensor are those of the stamp, or the newest if TF does not reach it.
-        Raises a PointCloudError if TF does not have what is asked for.
+        If TF does not reach the stamp, its newest transform is used. Raises a PointCloudError if
+        a transform or an orientation is missing.
         """
+        return self._look_up(header, self._newest)
+
+    def _look_up(self, header: Header, transform: Callable[..., Any]) -> CloudFrames:
         tilt, origin, base = None, None, None
         frame_id, frame = header.frame_id, self.config.frame
         if frame.level == 'tf':
             way = f'from its frame {frame_id!r} to frame.base = {frame.base!r}'
-            found = self._newest(frame.base, frame_id, header, way)
+            found = transform(frame.base, frame_id, header, way)
             base = rotation_of(found.rotation), np.array(_translation_of(found, way))
             tilt = angles_of(base[0][2])
         elif self._imu is not None:
-            tilt = angles_of(self._turn_by_imu(self._imu, header)[2])
+            message = self._imu.at(header)
+            turn, imu_frame = rotation_of(message.orientation), message.header.frame_id
+            if imu_frame != frame_id:
+                way = f'from its frame {frame_id!r} to that of {self._imu.topic}, {imu_frame!r}'
+                turn = turn @ rotation_of(transform(imu_frame, frame_id, header, way).rotation)
+            tilt = angles_of(turn[2])
         if frame.sensor != NO_FRAME:
             way = f'from frame.sensor = {frame.sensor!r} to its frame {frame_id!r}'
-            found = self._newest(frame_id, frame.sensor, header, way)
-            origin = _translation_of(found, way)
+            origin = _translation_of(transform(frame_id, frame.sensor, header, way), way)
         return CloudFrames(tilt, origin, base)
 
-    def _turn_by_imu(self, listener: ImuListener, header: Header) -> FloatArray:
-        """Return the rotation (3, 3) of a cloud into a level frame, by way of that of the IMU."""
-        found = listener.at(header)
-        turn, frame = rotation_of(found.orientation), found.header.frame_id
-        if frame == header.frame_id:
-            return turn
-        way = f'from its frame {header.frame_id!r} to that of {listener.topic}, {frame!r}'
+    def _exact(self, target: str, source: str, header: Header, way: str) -> Any:
         if self._tf2_ros is None:
             raise PointCloudError(f'transform {way}: needs tf2_ros ({INSTALL_TF2})')
-        return turn @ rotation_of(self._newest(frame, header.frame_id, header, way).rotation)
-
-    def _exact(self, target: str, source: str, header: Header) -> Any:
         stamp = Time.from_msg(header.stamp)
         return self._buffer.lookup_transform(target, source, stamp).transform
 
     def _newest(self, target: str, source: str, header: Header, way: str) -> Any:
         try:
             try:
-                return self._exact(target, source, header)
-            except self._tf2_ros.ExtrapolationException:
+                return self._exact(target, source, header, way)
+            except self._too_late:
                 # The newest: a sensor is fixed to its vehicle.
                 return self._buffer.lookup_transform(target, source, Time()).transform
-        except self._tf2_ros.TransformException as error:
+        except self._not_yet as error:
             raise PointCloudError(f'no transform {way}: {error}') from error
 
     def time_jumped(self, seconds: float) -> None:
@@ -264,14 +251,14 @@ class FrameListener:
 
 
 class KeptPose:
-    """Pose of the newest cloud of one frame that showed the ground well, until it is forgotten."""
+    """Pose of the last cloud that showed the ground well, for later clouds in the same frame."""
 
     def __init__(self) -> None:
         self._frame = ''
         self.forget()
 
     def forget(self) -> None:
-        """Have no pose, as after the start."""
+        """Keep no pose, as after the start."""
         self._pose: SensorPose | None = None
         self._is_in_use = False
 
@@ -283,7 +270,7 @@ class KeptPose:
         return self._pose
 
     def note(self, pose: SensorPose) -> bool:
-        """Take the pose used for that cloud; return whether use of the one kept begins with it."""
+        """Take the pose of a cloud; return whether it is the first to have the kept one."""
         begins = pose.is_fallback and not self._is_in_use
         self._is_in_use = pose.is_fallback
         if pose.is_well_seen:

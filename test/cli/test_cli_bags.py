@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ import ros_helpers as ros
 from bag_samples import PERIOD, START, write_ros1_bag, write_ros2_bag
 from cli_runner import PATIENCE, error_line, run, start, wait_for
 from rclpy.node import Node
-from ros_helpers import isolated_context, spinning
+from ros_helpers import Collector, isolated_context, spinning
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
@@ -30,38 +31,29 @@ def stock_transport(monkeypatch):
     monkeypatch.setattr(session, '_free_shared_memory', lambda: 0)
 
 
-class Listener:
-    """Subscribes to clouds and /clock; keeps the bytes, and when they were sent [ns]."""
-
-    def __init__(self, context, topics, qos):
-        self.node = Node('listener', context=context)
-        self.clouds = {topic: [] for topic in topics}
-        self.times = {topic: [] for topic in topics}
-        self.clock = []
-        self.subscriptions = [self._subscribe(topic, qos) for topic in topics]
-        self.node.create_subscription(Clock, '/clock', self._tick, ros.RELIABLE)
-
-    def _subscribe(self, topic, qos):
-        def receive(raw, info):
-            self.times[topic].append(info['source_timestamp'])
-            self.clouds[topic].append(raw)
-
-        return self.node.create_subscription(PointCloud2, topic, receive, qos, raw=True)
-
-    def _tick(self, message):
-        self.clock.append(message.clock.sec * 10**9 + message.clock.nanosec)
-
-    def wait(self, **counts):
-        for topic, n in counts.items():
-            wait_for(lambda c=self.clouds[f'/{topic}'], n=n: len(c) >= n, f'cloud {n} on {topic}')
-
-
 @contextlib.contextmanager
 def listening(*topics, qos=ros.RELIABLE):
+    """Bytes of the clouds on each topic, when they were sent, and times of /clock [ns]."""
     with isolated_context() as context:
-        listener = Listener(context, topics, qos)
-        with spinning(context, listener.node):
-            yield listener
+        node = Node('listener', context=context)
+        heard = SimpleNamespace(clouds={t: [] for t in topics}, times={t: [] for t in topics})
+
+        def receive(raw, info, topic):
+            heard.times[topic].append(info['source_timestamp'])
+            heard.clouds[topic].append(raw)
+
+        for topic in topics:
+            take = functools.partial(receive, topic=topic)
+            node.create_subscription(PointCloud2, topic, take, qos, raw=True)
+        clock = Collector(node, Clock, '/clock')
+        with spinning(context, node):
+            heard.clock = lambda: [m.clock.sec * 10**9 + m.clock.nanosec for m in clock.messages]
+            heard.n_publishers = lambda: sum(map(node.count_publishers, topics))
+            yield heard
+
+
+def wait_for_clouds(clouds, n):
+    wait_for(lambda: len(clouds) >= n, f'cloud {n}')
 
 
 def drive(folder, n_clouds, **options):
@@ -82,16 +74,17 @@ def test_every_byte_of_every_topic_at_the_recorded_times(tmp_path):
     end = START + 7 * PERIOD
     with listening('/front', '/rear') as listener:
         assert play(bag, '--clock', '--rate', 2) == 0
-        listener.wait(front=8, rear=8)
-        wait_for(lambda: listener.clock[-1:] == [end], 'end of /clock')
+        for clouds in listener.clouds.values():
+            wait_for_clouds(clouds, 8)
+        wait_for(lambda: listener.clock()[-1:] == [end], 'end of /clock')
     for topic, clouds in listener.clouds.items():
         assert clouds == recorded(bag, topic)
         # None before its time, counted from the first, which a busy machine sends late.
         times = np.array(listener.times[topic])
         assert (times[1:] - times[0] > np.arange(7) * PERIOD / 2).all()
     # The time of the bag, also between clouds.
-    assert listener.clock == sorted(listener.clock)
-    assert listener.clock[0] >= START and len(set(listener.clock)) > 8
+    clock = listener.clock()
+    assert clock == sorted(clock) and clock[0] >= START and len({*clock}) > 8
 
 
 def test_bag_of_ros_1_on_another_topic_for_a_best_effort_subscriber(tmp_path):
@@ -116,19 +109,19 @@ def test_loop_until_interrupted(tmp_path):
     words = 'play', drive(tmp_path, 3), '--loop', '--rate', 2, '--clock'
     with listening('/points') as listener, start(*words) as process:
         try:
-            listener.wait(points=7)
+            wait_for_clouds(listener.clouds['/points'], 7)
             process.send_signal(signal.SIGINT)
             output, errors = process.communicate(timeout=PATIENCE)
         finally:
             process.kill()
-        wait_for(lambda: listener.subscriptions[0].get_publisher_count() == 0, 'farewell')
+        wait_for(lambda: listener.n_publishers() == 0, 'farewell')
     assert (process.returncode, output) == (130, '')
     assert errors.splitlines()[-1] == 'gp-ground-seg: interrupted'
     assert 'Traceback' not in errors
     stamps = [stamp_of(decode_cloud(raw)) for raw in listener.clouds['/points']]
     assert stamps == list(itertools.islice(itertools.cycle(stamps[:3]), len(stamps)))
     # In each round the clock of the bag begins again.
-    assert (np.diff(listener.clock) < 0).sum() >= 2
+    assert (np.diff(listener.clock()) < 0).sum() >= 2
     # A period between the last of a round and the first of the next, as between the others.
     assert np.median(np.diff(listener.times['/points'])) > 0.5 * PERIOD / 2
 

@@ -1,6 +1,5 @@
 """The command `demo`: what it says, writes and leaves running; its counts."""
 
-import contextlib
 import importlib
 import os
 import re
@@ -19,48 +18,39 @@ from gp_ground_seg.cli.demo import Tally
 from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.data.bags import BagReader, decode_cloud
-from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
+from gp_ground_seg.data.point_cloud2 import select_points
 from gp_ground_seg.ros import loader, session
 from gp_ground_seg.ros.node_process import NodeProcess, private_session
 
 
-def sent_cloud(n=40, seed=0, stamp=5_000_000_007):
-    """A scan of road 40 and car 10, half and half, one outlier 1, one point not finite."""
-    rng = np.random.default_rng(seed)
-    points = rng.normal(0.0, 5.0, (n, 4)).astype(np.float32)
-    semantic = np.where(np.arange(n) % 2 == 0, 40, 10)
-    semantic[1] = 1
-    points[3, 2] = np.nan
-    return scan_cloud(points, stamp, demo.FRAME_ID, label=semantic.astype(np.uint32))
-
-
-def split(cloud, is_ground):
-    """What a right node makes of a scan: NaN in neither."""
-    finite = np.isfinite(read_xyz(cloud)).all(axis=1)
-    return {
-        'ground': select_points(cloud, is_ground & finite),
-        'obstacles': select_points(cloud, ~is_ground & finite),
-    }
-
-
 def test_labels_are_scored():
-    cloud, tally, is_ground = sent_cloud(), Tally(), np.arange(40) % 2 == 0
-    tally.add(cloud, split(cloud, is_ground), 0.05, False)
-    # The outlier does not count, what is not finite is in neither cloud.
+    """Of a scan of road 40 and car 10, half and half, one outlier 1, one point not finite."""
+    points = np.random.default_rng(0).normal(0.0, 5.0, (40, 4)).astype(np.float32)
+    is_road = np.arange(40) % 2 == 0
+    semantic = np.where(is_road, 40, 10).astype(np.uint32)
+    points[3, 2], semantic[1] = np.nan, 1
+    cloud, tally = scan_cloud(points, 5_000_000_007, demo.FRAME_ID, label=semantic), Tally()
+
+    def back(is_ground):
+        """What a right node makes of it: the point that is not finite in neither cloud."""
+        finite = np.isfinite(points).all(axis=1)
+        parts = ('ground', is_ground & finite), ('obstacles', ~is_ground & finite)
+        return {topic: select_points(cloud, chosen) for topic, chosen in parts}
+
+    tally.add(cloud, back(is_road), 0.05, False)
+    # The outlier does not count.
     assert tally.counts == {'tp': 20, 'fp': 0, 'fn': 0, 'tn': 18}
     assert (tally.n_sent, tally.n_back) == (39, 39)
-    is_ground[[0, 2, 5]] ^= True
-    other = sent_cloud(seed=1)
-    results = split(other, is_ground)
-    tally.add(other, results, 0.07, True)
+    wrong = back(is_road ^ np.isin(np.arange(40), (0, 2, 5)))
+    tally.add(cloud, wrong, 0.07, True)
     assert tally.counts == {'tp': 38, 'fp': 1, 'fn': 2, 'tn': 35}
     assert (tally.label == Label.GROUND).sum() == 19
     text = tally.summary()
     assert '78 in 2 scans sent, 78 back' in text
     assert f'IoU {100 * 38 / 41:.2f} %' in text and 'median 60.0 ms' in text
     assert 'numpy for 1 scans, compiled code for 1' in text and 'FAILED' not in text
-    results['ground'] = select_points(results['ground'], np.arange(19) != 4)
-    tally.add(other, results, 0.05, True)
+    wrong['ground'] = select_points(wrong['ground'], np.arange(19) != 4)
+    tally.add(cloud, wrong, 0.05, True)
     assert '117 in 3 scans sent, 116 back' in tally.summary()
     assert 'FAILED: each point must come back once' in tally.summary()
 
@@ -146,15 +136,10 @@ def test_a_node_that_ends_is_said(rclpy, tmp_path, words, number, said, logged):
     assert any(logged in line for line in node.log_lines() or [''])
 
 
-def test_a_node_ends_with_its_block(rclpy, tmp_path):
-    node = NodeProcess(tmp_path / 'node.log')
-    with contextlib.suppress(ZeroDivisionError), node:
-        assert is_running(node.pid)
-        raise ZeroDivisionError
-    assert not is_running(node.pid)
+def test_the_log_says_whether_the_node_has_its_compiled_code(tmp_path):
     for text in ('', loader.FOLLOWS, loader.STAYS, loader.CHANGED):
         (tmp_path / 'node.log').write_text(text)
-        assert node.is_compiled() == (text == loader.CHANGED)
+        assert NodeProcess(tmp_path / 'node.log').is_compiled() == (text == loader.CHANGED)
 
 
 def profile_in_use():

@@ -254,7 +254,7 @@ def test_numbers_are_read_as_ros_reads_them(from_text, number):
         ('grid: {n_bins: 0x' + 'f' * 200_000 + '}', 'line 1: a number of 200002 digits'),
         ('grid: {n_bins: !!int x}', 'not valid YAML: invalid literal'),
         ('grid: {n_bins: 2011-02-03}', 'grid.n_bins = datetime.date(2011, 2, 3): must be an int'),
-        ('grid: ' + '[' * 3000, 'line 1: more than 20 levels'),
+        ('grid: ' + '[' * 3000, 'not valid YAML: maximum recursion depth'),
         ('\n'.join(f'a{k}: 1' for k in range(2000)), 'more than 500 values'),
         ('/**: {ros__parameters: {}, a: 1}', 'values beside ros__parameters, which ROS refuses'),
         ('grid: &a {n_bins: 9}\nlabel: *a', 'line 2: aliases (*name) are not accepted'),

@@ -51,10 +51,11 @@ def test_every_parameter_is_explained_above_it():
         assert line.startswith(f'      {spec.name.split(".")[1]}: ')
         assert all(part in words for part in (spec.description, spec.unit, spec.symbol))
         if spec.type in (int, float):
-            assert f'{spec.minimum:.10g} to {spec.maximum:.10g}' in words
+            assert f'[{spec.minimum:g}, {spec.maximum:g}]' in words
         else:
-            words_of = {bool: ['true or false'], tuple: ['none or six numbers, -100 to 100 m']}
-            expected = words_of.get(spec.type, spec.choices or ['[a name]'])
+            box = 'none or six numbers in [-100, 100] m'
+            words_of = {bool: ['true or false'], tuple: [box]}
+            expected = words_of.get(spec.type, spec.choices or ['(a name)'])
             assert all(choice in words for choice in expected)
         words = ''
     assert next(specs, None) is None
@@ -81,7 +82,7 @@ def test_the_table_has_a_row_for_each_parameter_that_people_set():
         cells = [cell.strip().replace('\0', '|') for cell in cells[1:-1]]
         assert cells[0] == f'`{spec.name}`'
         assert yaml.safe_load(cells[1].strip('`')) == spec.default
-        assert cells[2].endswith(spec.unit)
+        assert spec.unit in cells[2].split(']')[-1]
         assert cells[3] == spec.description + f' (`{spec.symbol}`)' * bool(spec.symbol)
 
 

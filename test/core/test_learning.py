@@ -19,7 +19,6 @@ from gp_ground_seg.core.gp.learning import (
     given_theta,
     theta_space,
 )
-from gp_ground_seg.core.gp.search import search_from
 from gp_ground_seg.core.jit import JIT_ENABLED
 from gp_ground_seg.core.parameters.config import PRESETS
 from gp_ground_seg.core.pipeline.lines import class_middles
@@ -68,11 +67,8 @@ def learn(inliers, space, start, use_priors=True, max_evaluations=200):
         values.append(value)
         return value
 
-    search = search_from(theta, space.lower.copy(), space.upper.copy())
     with patch.object(learning, 'set_likelihood', set_likelihood):
-        n = learning.maximise(
-            space, inliers, 0.0, use_priors, max_evaluations, search, theta, outcome
-        )
+        n = learning.maximise(space, inliers, 0.0, use_priors, max_evaluations, theta, outcome)
     assert n == len(values)
     return Learned.of(theta, float(outcome[0]), n, int(outcome[1]), space), values
 

@@ -87,7 +87,7 @@ def test_a_cluttered_plane_is_recovered(seed, height, roll, pitch, yaw):
     pose = pose_of(points)
     assert pose.height_estimated
     np.testing.assert_allclose((pose.measured.roll, pose.measured.pitch), (roll, pitch), atol=0.01)
-    assert pose.measured.plane.residual < 0.1 and 0.5 < pose.measured.plane.support <= 1.0
+    assert 0.5 < pose.measured.plane.support <= 1.0
     if not pose.is_level:
         assert pose.height == pytest.approx(height, abs=0.04)
     order = np.random.default_rng(seed).permutation(len(points))

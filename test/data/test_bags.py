@@ -8,17 +8,10 @@ import pytest
 from rosbags import rosbag2
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosReliability
-from rosbags.typesys import Stores, get_typestore
 
 from gp_ground_seg.core.errors import DataError, MissingDependencyError
 from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag_folder, resolve_storage
-from gp_ground_seg.data.bags import (
-    BagReader,
-    BagWriter,
-    decode_cloud,
-    encode_cloud,
-    jazzy_types,
-)
+from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud, jazzy_types
 from gp_ground_seg.data.inputs import holds_bag
 
 SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive.db3', None)]
@@ -49,7 +42,6 @@ def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
         assert bag.storage == resolve_storage(path, storage)
         assert list(bag.messages()) == written
         assert list(bag.messages(['/note'])) == written[::2]
-        assert list(bag.messages([])) == []
     if path.is_dir():
         suffix = '.mcap' if storage == 'mcap' else '.db3'
         assert listing(path) == [f'drive{suffix}', 'metadata.yaml']
@@ -73,8 +65,7 @@ def test_packed_bags_are_read(tmp_path, storage, mode):
     writer = rosbag2.Writer(tmp_path / 'drive', version=9, storage_plugin=plugin)
     writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
     with writer:
-        types = get_typestore(Stores.ROS2_JAZZY)
-        topic = writer.add_connection('/points', POINT_CLOUD2, typestore=types)
+        topic = writer.add_connection('/points', POINT_CLOUD2, typestore=jazzy_types())
         for k, data in enumerate(raw):
             writer.write(topic, k, data)
     assert is_bag_folder(tmp_path / 'drive')
@@ -91,44 +82,36 @@ def test_clouds_of_ros1(tmp_path):
     with BagReader(path) as bag:
         assert bag.storage == 'ros1'
         topic = bag.pick_point_cloud_topic()
-        expected = [
+        assert list(bag.messages([topic])) == [
             (topic, samples.START + k * samples.PERIOD, encode_cloud(samples.cloud(k)))
             for k in range(3)
         ]
-        assert list(bag.messages([topic])) == list(bag.messages()) == expected
         assert bag.topics['/odd'] == 'my_msgs/msg/Odd, ros1'
         assert bag.n_messages('/text') == 6  # of two publishers
-        with pytest.raises(DataError, match=r'/text has messages of .*, ros1; one topic'):
-            next(bag.messages(['/text']))
 
 
-def test_several_cloud_topics_are_listed(tmp_path):
-    samples.write_ros2_bag(tmp_path / 'two', topics=('/front', '/rear'))
-    with BagReader(tmp_path / 'two') as bag:
+def test_the_topic_is_chosen_and_what_a_folder_lacks_is_noticed(tmp_path):
+    path = tmp_path / 'two'
+    samples.write_ros2_bag(path, topics=('/front', '/rear'), storage='sqlite3')
+    with BagReader(path) as bag:
         with pytest.raises(DataError, match='choose one with --topic: /front, /rear'):
             bag.pick_point_cloud_topic()
         assert bag.pick_point_cloud_topic('/rear') == '/rear'
-        with pytest.raises(DataError, match=r'no topic /left'):
+        with pytest.raises(DataError, match=r'no topic /left; topics here: /front \('):
             list(bag.messages(['/left']))
-
-
-def test_what_a_folder_lacks_is_noticed(tmp_path):
-    path = tmp_path / 'drive'
-    samples.write_ros2_bag(path, storage='sqlite3')
-    with sqlite3.connect(path / 'drive.db3') as connection:
-        connection.execute('DELETE FROM messages WHERE id = 4')
+        with pytest.raises(DataError, match=r'/note is of type std_msgs/msg/String, must be'):
+            bag.pick_point_cloud_topic('/note')
+    with sqlite3.connect(path / 'two.db3') as connection:
+        connection.execute('DELETE FROM messages WHERE id = 5')
     connection.close()
-
-    def assert_refused(message):
-        with pytest.raises(DataError, match=message) as caught:
-            read_all(path)
-        assert '\n' not in str(caught.value)
-
-    assert_refused('topic /points lists 3 messages, 2 could be read')
-    (path / 'drive.db3-wal').write_bytes(b'left by a crash')
-    assert_refused('was not closed, some of it is in drive.db3-wal')
+    with pytest.raises(DataError, match='topic /front lists 3 messages, 2 could be read'):
+        read_all(path)
+    (path / 'two.db3-wal').write_bytes(b'left by a crash')
+    with pytest.raises(DataError, match=r'was not closed, some of it is in two\.db3-wal'):
+        read_all(path)
     (path / 'metadata.yaml').unlink()
-    assert_refused(r'no metadata\.yaml in it\).*one by one: drive\.db3')
+    with pytest.raises(DataError, match=r'no metadata\.yaml in it\).*one by one: two\.db3$'):
+        read_all(path)
 
 
 def test_errors_of_the_caller_pass_unchanged(tmp_path):
@@ -170,26 +153,21 @@ def test_a_bag_is_replaced_with_force_only_and_by_a_whole_one_only(tmp_path, nam
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
-def test_force_never_replaces_what_is_no_bag(tmp_path):
-    (tmp_path / 'home').mkdir()
-    (tmp_path / 'folder.mcap').mkdir()
-    for name in ('home/thesis.tex', 'home/metadata.yaml', 'file'):
-        (tmp_path / name).write_text('years of work')
-    files = listing(tmp_path)
-    for name in ('home', 'file', 'folder.mcap'):
+@pytest.mark.parametrize('name', ['home', 'file', 'folder.mcap'])
+def test_what_is_no_bag_is_never_replaced(tmp_path, name):
+    """Also where it appears while the bag is written."""
+    with BagWriter(tmp_path / name, force=True) as bag:
+        for folder in ('home', 'folder.mcap'):
+            (tmp_path / folder).mkdir()
+        for file in ('home/thesis.tex', 'home/metadata.yaml', 'file'):
+            (tmp_path / file).write_text('years of work')
+        files = {*tmp_path.rglob('[!.]*')} - {*tmp_path.glob('.*/**/*')}
         with pytest.raises(DataError, match='not replaced'):
-            BagWriter(tmp_path / name, force=True).__enter__()
-    assert listing(tmp_path) == files
-    assert (tmp_path / 'file').read_text() == 'years of work'
-
-
-@pytest.mark.parametrize('name', ['drive', 'drive.mcap'])
-def test_output_that_appeared_meanwhile_is_kept(tmp_path, name):
-    with BagWriter(tmp_path / name) as bag:
-        (tmp_path / name).write_text("another process's")
-        with pytest.raises(DataError, match=r'exists already|not replaced'):
             bag.__exit__(None, None, None)
-    assert (tmp_path / name).read_text() == "another process's"
+    with pytest.raises(DataError, match='not replaced'):
+        BagWriter(tmp_path / name, force=True).__enter__()
+    assert {*tmp_path.rglob('*')} == files
+    assert (tmp_path / 'file').read_text() == 'years of work'
 
 
 def test_impossible_output_is_refused(tmp_path):
@@ -201,28 +179,10 @@ def test_impossible_output_is_refused(tmp_path):
         with pytest.raises(DataError, match=message), BagWriter(tmp_path / name, storage=storage):
             pass
     assert listing(tmp_path) == []
-
-
-def test_unusual_names_work(tmp_path):
-    """Other names are in test_refused_files.py; sqlite reads a # and a ? as part of a URL."""
-    written = samples.write_ros2_bag(tmp_path / 'a.db3')
+    samples.write_ros2_bag(tmp_path / 'a.db3')
     (tmp_path / 'a.db3').rename(tmp_path / 'a#2?.db3')
-    assert read_all(tmp_path / 'a#2?.db3') == written
-
-
-def test_a_topic_is_declared_once_and_has_one_type(tmp_path):
-    with BagWriter(tmp_path / 'x.mcap') as bag:
-        bag.add_topic('/same')
-        with pytest.raises(DataError, match='topic /same twice'):
-            bag.add_topic('/same')
-        bag.add_topic('/diff', 'std_msgs/msg/String')
-        bag.write('/same', 1, encode_cloud(samples.cloud(n_ground=1, n_wall=1)))
-        bag.write('/diff', 2, samples.string_message('x'))
-    content = (tmp_path / 'x.mcap').read_bytes()
-    (tmp_path / 'y.mcap').write_bytes(content.replace(b'/diff', b'/same'))
-    found = 'topic /same has messages of sensor_msgs/msg/PointCloud2 and std_msgs/msg/String'
-    with BagReader(tmp_path / 'y.mcap') as bag, pytest.raises(DataError, match=found):
-        next(bag.messages(['/same']))
+    with pytest.raises(DataError, match=r'sqlite3 bag cannot have # \? in its path'):
+        BagReader(tmp_path / 'a#2?.db3')
 
 
 @pytest.mark.parametrize('call', [BagReader, BagWriter, decode_cloud])

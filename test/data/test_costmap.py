@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from conftest import simulated
 from scipy import ndimage
 
 from gp_ground_seg import Config, GroundSegmenter, Label
@@ -12,12 +13,10 @@ from gp_ground_seg.core.frame import GroundSurface
 from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.data import costmap
 from gp_ground_seg.data.costmap import DIRECTIONS, FREE, OCCUPIED, UNKNOWN, SegmentedCloud
-from gp_ground_seg.lab.simulation import SCENES, SENSORS, Kind, simulate_scan
+from gp_ground_seg.lab.simulation import Kind
 from gp_ground_seg.lab.simulation.objects import standing_box
 from gp_ground_seg.lab.simulation.scenes import Scene
 from gp_ground_seg.lab.simulation.terrain import flat
-
-BAND = {'output.min_height': 0.2, 'output.max_height': 2.0}
 
 
 def segmented_points(xyz, config):
@@ -25,11 +24,16 @@ def segmented_points(xyz, config):
     return SegmentedCloud(None, GroundSegmenter(config).segment(xyz), config, xyz)
 
 
-def street(sensor='hdl-64e', seed=0, scene='urban', **values):
-    """Simulated scan, and what is published of it."""
-    scan = simulate_scan(SCENES[scene](seed), SENSORS[sensor], np.random.default_rng(seed))
-    config = Config().replace(**{**BAND, **values})
-    return scan, segmented_points(scan.points[:, :3], config)
+def street(scene='urban', sensor='hdl-64e', seed=0, lowest=0.2, highest=2.0):
+    """Simulated scan, and what is published of it between two heights."""
+    scan = simulated(scene, sensor, seed)
+    heights = {'output.min_height': lowest, 'output.max_height': highest}
+    return scan, segmented_points(scan.points[:, :3], Config().replace(**heights))
+
+
+def in_sight(cloud):
+    """What `scan_ranges` gives of a cloud."""
+    return costmap.scan_ranges(cloud.places(cloud.is_obstacle), tuple(cloud.points.T[:2]))
 
 
 def occupancy_of(segmented):
@@ -108,8 +112,8 @@ def test_the_ground_is_known_as_far_as_that_of_the_segment_of_a_direction():
     ],
 )
 def test_nothing_that_stands_is_missing_and_ground_is_no_obstacle(scene, sensor, seed):
-    """Of the simulated street, within the grid: things of 0.3 to 2 m over its exact ground."""
-    scan, segmented = street(sensor, seed, scene)
+    """Of the simulated street, within the grid: objects of 0.3 to 2 m over its exact ground."""
+    scan, segmented = street(scene, sensor, seed)
     state = occupancy_of(segmented)
     xyz = segmented.points.astype(np.float64)
     height, r = xyz[:, 2] - scan.ground_z, np.hypot(xyz[:, 0], xyz[:, 1])
@@ -125,23 +129,21 @@ def test_nothing_that_stands_is_missing_and_ground_is_no_obstacle(scene, sensor,
     n_returns = cells_of(stands)
     missing = (n_returns > 0) & (state != OCCUPIED)
     assert missing.sum() <= 0.002 * np.count_nonzero(n_returns)
-    things, n_things = ndimage.label(n_returns > 0, np.ones((3, 3)))
-    numbers = np.arange(1, n_things + 1)
-    found = ndimage.maximum(state, things, numbers) == OCCUPIED
-    assert n_things > 10
-    assert found[ndimage.sum(n_returns, things, numbers) >= 3].all()
+    objects, n_objects = ndimage.label(n_returns > 0, np.ones((3, 3)))
+    numbers = np.arange(1, n_objects + 1)
+    found = ndimage.maximum(state, objects, numbers) == OCCUPIED
+    assert n_objects > 10
+    assert found[ndimage.sum(n_returns, objects, numbers) >= 3].all()
     # What is ground and nothing else.
     is_free = (cells_of(near & scan.is_ground) > 0) & (cells_of(~scan.is_ground & (r < 20.0)) == 0)
     assert is_free.sum() > 5000
     assert np.count_nonzero(is_free & (state == OCCUPIED)) <= 0.01 * is_free.sum()
-    # The same of the scan: no thing is nearer than it says, and ground stops few directions.
+    # The same of the scan: no object is nearer than it says, and ground stops few directions.
     direction = costmap.direction_of(xyz[:, 0], xyz[:, 1])
     truth = np.full((2, DIRECTIONS), np.inf)
     np.minimum.at(truth[0], direction[stands], r[stands])
     np.minimum.at(truth[1], direction[~scan.is_ground], r[~scan.is_ground])
-    scanned = costmap.scan_ranges(
-        segmented.places(segmented.is_obstacle), tuple(segmented.points.T[:2])
-    )
+    scanned = in_sight(segmented)
     assert np.isfinite(scanned[np.isfinite(truth[0])]).mean() >= 0.998
     assert (scanned[np.isfinite(truth[0])] <= truth[0][np.isfinite(truth[0])] + 0.1).mean() > 0.99
     # But for kerbs, 0.15 m high, and ground at the foot of walls, where there is no model.
@@ -149,7 +151,7 @@ def test_nothing_that_stands_is_missing_and_ground_is_no_obstacle(scene, sensor,
 
 
 def test_heights_choose_and_unknown_heights_stay():
-    _, every = street(**{'output.min_height': -100.0, 'output.max_height': 100.0})
+    _, every = street(lowest=-100.0, highest=100.0)
     label, height = every.segmentation.label, every.segmentation.labelled.height
     np.testing.assert_array_equal(every.is_obstacle, label == Label.OBSTACLE)
     np.testing.assert_array_equal(every.is_ground, label == Label.GROUND)
@@ -161,12 +163,11 @@ def test_heights_choose_and_unknown_heights_stay():
 
 
 def test_a_map_is_upright_whatever_the_tilt_of_the_cloud():
-    """Verticals through the points meet z = 0 of the cloud."""
+    """Verticals through the points meet z = 0 of the cloud, unless that is level."""
     _, level = street()
-    tilt = {'sensor.roll': 0.2, 'sensor.pitch': -0.3}
-    config, matrix = level.config.replace(**tilt), rotation(0.2, -0.3)
+    config, matrix = level.config, rotation(0.2, -0.3)
     xyz = level.points @ matrix.astype(np.float32)
-    tilted = segmented_points(xyz, config)
+    tilted = segmented_points(xyz, config.replace(**{'sensor.roll': 0.2, 'sensor.pitch': -0.3}))
     x, y = tilted.places(np.ones(len(xyz), bool))
     upright = np.stack([x, y, 0.0 * x], axis=-1) @ matrix.T
     np.testing.assert_allclose(upright[:, :2], level.points[:, :2], atol=1e-3)
@@ -174,39 +175,26 @@ def test_a_map_is_upright_whatever_the_tilt_of_the_cloud():
     known, found = occupancy_of(level), occupancy_of(tilted)
     for value in (FREE, OCCUPIED):
         assert (found == value).sum() == pytest.approx((known == value).sum(), rel=0.2)
-
-
-def test_a_plane_on_edge_is_no_map():
-    config = Config().replace(**{'sensor.roll': 1.55, 'sensor.pitch': 0.0})
-    _, level = street()
     xyz = level.points @ rotation(1.55, 0.0).astype(np.float32)
-    segmented = segmented_points(xyz, config)
+    upright = {'sensor.roll': 1.55, 'sensor.pitch': 0.0}
     with pytest.raises(PointCloudError, match='its plane is no map'):
-        segmented.places(segmented.is_obstacle)
+        in_sight(segmented_points(xyz, config.replace(**upright)))
 
 
 @pytest.mark.parametrize('sensor', ['hdl-64e', 'os1-128', 'vlp-16'])
 def test_a_low_wall_is_in_the_way_in_every_direction(sensor):
     # 0.4 m high and 12 m long, across the way: all of it is seen from 0.15 m over the ground on.
     terrain = flat()
-    wall = standing_box(terrain, 6.0, 0.0, (0.3, 12.0, 0.4))
-    scan = simulate_scan(
-        Scene('wall', terrain, (wall,)), SENSORS[sensor], np.random.default_rng(1)
-    )
-    config = Config().replace(**{'output.min_height': 0.15})
-    xyz = scan.points[:, :3]
-    segmented = segmented_points(xyz, config)
-    returns = tuple(segmented.points.T[:2])
-    found = costmap.scan_ranges(segmented.places(segmented.is_obstacle), returns)
+    wall = Scene('wall', terrain, (standing_box(terrain, 6.0, 0.0, (0.3, 12.0, 0.4)),))
+    scan, segmented = street(wall, sensor, 1, lowest=0.15)
+    found = in_sight(segmented)
     # Each direction in the middle of which the wall lies.
     middle = (np.arange(DIRECTIONS) + 0.5) * 2.0 * np.pi / DIRECTIONS - np.pi
-    towards = abs(np.tan(middle)) < 5.8 / 5.85
-    towards &= np.cos(middle) > 0.0
+    towards = (abs(np.tan(middle)) < 5.8 / 5.85) & (np.cos(middle) > 0.0)
     assert abs(found[towards] * np.cos(middle[towards]) - 5.85).max() < 0.2
     rows = np.flatnonzero((occupancy_of(segmented) == OCCUPIED).any(axis=1))
-    cells = np.unique(
-        np.floor(xyz[~scan.is_ground & (scan.points[:, 2] > scan.ground_z + 0.2), 1] / 0.1)
-    )
-    assert set(cells.astype(int) + 200) <= set(rows.tolist())
+    is_wall = ~scan.is_ground & (scan.points[:, 2] > scan.ground_z + 0.2)
+    cells = np.floor(scan.points[is_wall, 1] / 0.1).astype(int) + 200
+    assert set(cells.tolist()) <= set(rows.tolist())
     # None of the ground is.
     assert not (segmented.is_obstacle & scan.is_ground).any()

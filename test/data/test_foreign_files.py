@@ -18,7 +18,8 @@ def what_is_read(path):
     try:
         if path.suffix in ('.pcd', '.ply'):
             cloud = decode_file(path, path.read_bytes())
-            np.testing.assert_array_equal(cloud.xyz, XYZ)
+            n_points = {'one_point': 1, 'no_point': 0}.get(path.stem, len(XYZ))
+            np.testing.assert_array_equal(cloud.xyz, XYZ[:n_points])
             return ' '.join(cloud.fields.dtype.names)
         inputs = list_inputs(path)
         for one in inputs:

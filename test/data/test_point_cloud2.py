@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.data import point_cloud2
-from gp_ground_seg.data.bag_files import POINT_CLOUD2
 from gp_ground_seg.data.bags import (
     cloud_from_columns,
     decode_cloud,
@@ -71,12 +70,12 @@ def layouts(draw):
 
 
 def all_points(layout, raw):
-    starts = [
-        row * layout.row_step + column * layout.point_step
+    step = layout.point_step
+    return [
+        raw[row * layout.row_step + column * step :][:step]
         for row in range(layout.height)
         for column in range(layout.width)
     ]
-    return [raw[start : start + layout.point_step] for start in starts]
 
 
 @settings(max_examples=100)
@@ -85,13 +84,11 @@ def test_coordinates_and_selections_agree_with_struct(case, random):
     layout, raw = case
     points = all_points(layout, raw)
     order = '>' if layout.is_bigendian else '<'
-    where = {field.name: field for field in layout.fields}
+    axes = sorted(field for field in layout.fields if field.name in 'xyz')
     expected = [
-        [
-            struct.unpack_from(order + STRUCT_CODES[where[a].datatype], point, where[a].offset)[0]
-            for a in 'xyz'
-        ]
+        struct.unpack_from(order + STRUCT_CODES[axis.datatype], point, axis.offset)[0]
         for point in points
+        for axis in axes
     ]
     xyz = read_xyz(layout)
     assert xyz.dtype.isnative
@@ -197,7 +194,6 @@ WRONG = [
     (read_xyz, field('intensity', name='y'), r'2 fields named y: must have exactly one'),
     (read_xyz, field('z', datatype=4),
      r'z has datatype 4 \(UINT16\): must be FLOAT32 \(7\) or FLOAT64 \(8\)'),
-    (read_xyz, field('z', datatype=77), r'field z has datatype 77 \(unknown\)'),
     (read_xyz, field('z', count=3), r'field z has count 3: must be 1'),
     (read_xyz, field('z', offset=13), r'z at offset 13 of 4 bytes.*point_step 16'),
     (read_xyz, field('z', offset=-4), r'z at offset -4'),
@@ -225,45 +221,30 @@ def test_what_cannot_be_is_refused_and_says_where(call, changes, message):
         call(kitti_layout(**changes))
 
 
-def assert_same_cloud(cloud, expected):
-    for field in dataclasses.fields(expected):
-        np.testing.assert_equal(getattr(cloud, field.name), getattr(expected, field.name))
-
-
 def test_selection_and_another_stamp_keep_all_else():
+    def assert_same(cloud, expected):
+        cloud = decode_cloud(encode_cloud(cloud))
+        for field in dataclasses.fields(expected):
+            np.testing.assert_equal(getattr(cloud, field.name), getattr(expected, field.name))
+
     cloud = samples.cloud(2)
     mask = np.isfinite(read_xyz(cloud)).all(axis=1)
-    kept = decode_cloud(encode_cloud(point_cloud2.select_points(cloud, mask)))
     data = cloud.data.reshape(-1, cloud.point_step)[mask].ravel()
-    shape = {'width': mask.sum(), 'row_step': len(data)}
-    assert_same_cloud(kept, dataclasses.replace(cloud, **shape, data=data, is_dense=True))
+    shape = {'width': mask.sum(), 'row_step': len(data), 'data': data, 'is_dense': True}
+    assert_same(point_cloud2.select_points(cloud, mask), dataclasses.replace(cloud, **shape))
     assert not point_cloud2.select_points(cloud, ~mask).is_dense
-    moved = decode_cloud(encode_cloud(with_stamp(cloud, (7, 8))))
+    moved = with_stamp(cloud, (7, 8))
     assert (stamp_of(moved), moved.header.frame_id) == ((7, 8), 'velo_link')
-    assert_same_cloud(dataclasses.replace(moved, header=cloud.header), cloud)
+    assert_same(dataclasses.replace(moved, header=cloud.header), cloud)
 
 
 def test_cloud_from_columns_is_packed_and_typed():
     points = samples.scan(1)
-    label = np.arange(len(points), dtype=np.uint32)
-    columns = {'x': points[:, 0], 'y': points[:, 1], 'z': points[:, 2], 'label': label}
+    columns = {**dict(zip('xyz', points.T, strict=False)), 'label': np.arange(1801, dtype='u4')}
     cloud = decode_cloud(encode_cloud(cloud_from_columns((5, 6), 'lidar', columns)))
     assert [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields] == [
         ('x', 0, 7, 1), ('y', 4, 7, 1), ('z', 8, 7, 1), ('label', 12, 6, 1),
     ]  # fmt: skip
     assert (stamp_of(cloud), cloud.header.frame_id) == ((5, 6), 'lidar')
     np.testing.assert_array_equal(read_xyz(cloud), points[:, :3])
-    np.testing.assert_array_equal(read_columns(cloud, ['label'])['label'][0], label)
-    assert cloud_from_columns((0, 0), '', {}).width == 0
-
-
-@settings(max_examples=60)
-@given(st.integers(0, 400), st.binary(max_size=8))
-def test_bytes_that_are_no_cloud_are_refused_or_read(length, junk):
-    damaged = encode_cloud(samples.cloud(0, n_ground=5, n_wall=1))[:length] + junk
-    said = ''
-    try:
-        decode_cloud(damaged)
-    except PointCloudError as error:
-        said = str(error)
-    assert not said or f'{len(damaged)} bytes that are no {POINT_CLOUD2}' in said
+    np.testing.assert_array_equal(read_columns(cloud, ['label'])['label'][0], columns['label'])

@@ -20,7 +20,7 @@ from foreign_files import BE, LE, RAW, XYZ, pcd, ply
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gp_ground_seg.core.errors import DataError, shown
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.bags import BagWriter, encode_cloud
 from gp_ground_seg.data.cloud_files import WRITABLE, encode_file
 from gp_ground_seg.data.clouds import cloud_of, name_columns
@@ -88,7 +88,7 @@ def write_long_record(path):
         file.write(struct.pack('<I', 3_000_000_000))
 
 
-NO_BAG = 'cannot be read as a bag: '
+NO_BAG = 'cannot be read as a bag; '
 REFUSED = {
     'missing.npy': (None, 'no such file or folder'),
     'notes.docx': (b'hello', r'not a scan or bag; accepted are \.bin, \.pcd'),
@@ -105,10 +105,8 @@ REFUSED = {
     'flat.npy': (npy(np.arange(9.0)), r'array of shape \(9,\): must be \(N, 3\)'),
     'shape.npz': (npz(a=npy_header((10**9, 3)) + bytes(10**6)), r'cannot be read as \.npz \('),
     'names.npz': (npz(a=npy(XYZ), b=npy(XYZ)), r'arrays a \(4, 3\), b \(4, 3\):'),
-    'flat.npz': (npz(a=npy(np.arange(9.0))), r'arrays a \(9,\): must be x, y, z, or one'),
     'none.pcd': (b'no header', 'no DATA line'),
     'commas.pcd': (pcd(body=4 * b'0,1,2\n'), 'a line of 1 words, its header says 3, separated by'),
-    'wide_text.pcd': (pcd(COUNT='1 1 500000000'), '500000002 numbers per point'),
     'sizes.pcd': (pcd(WIDTH='9'), '4 points, which is not width 9'),
     'many.pcd': (many(8000000), '8000000 points'),
     'packed.pcd': (
@@ -118,9 +116,7 @@ REFUSED = {
     'wide.pcd': (four(count='500000000', WIDTH='0', POINTS='0'), '500000003 numbers per point'),
     'bytes.pcd': (four('8', count='900', WIDTH='0', POINTS='0').replace(b' a\n', b' _\n')
                   .replace(b'900', b'900000000'), '7200000012 bytes per point'),
-    'size.pcd': (four('2147483647'), 'field a: no type F of 2147483647 bytes'),
     'count.pcd': (four(count='9' * 11), 'COUNT 99999999999: must be a whole number, at most 4'),
-    'no_number.pcd': (pcd(WIDTH=''), 'WIDTH : must be a whole number'),
     'type.pcd': (pcd(types='X F F'), 'field x: no type X of 4 bytes'),
     'data.pcd': (pcd(data='other'), 'DATA other: must be'),
     'element.ply': (ply().replace(b'vertex 4', b'vertex'), 'no PLY|element vertex : must have'),
@@ -215,10 +211,8 @@ def test_sqlite_bag_that_lost_its_last_bytes(whole, tmp_path, n_bytes):
 
 HUGE = (
     ('segment SCAN -o a.label', 'SCAN', f'accepted are at most {1 << 30}'),
-    ('evaluate ROOT', 'SCAN', f'accepted are at most {1 << 30}'),
     ('evaluate ROOT', 'LABEL', 'expected 7204 for 1801 points'),
     ('plot scan SCAN --labels LABEL -o a.png', 'LABEL', 'expected 7204 for 1801 points'),
-    ('kitti-to-bag ROOT --sequence 00 a.mcap', 'LABEL', 'expected 7204 for 1801 points'),
     ('evaluate ROOT', 'TIMES', 'accepted are at most'),
     ('segment SCAN --config YAML -o a.label', 'YAML', 'too large for a parameter file'),
 )
@@ -253,38 +247,38 @@ def test_too_little_memory_is_one_line(tmp_path):
     assert done.stderr.splitlines()[-1] == 'gp-ground-seg: error: not enough memory for this input'
 
 
-def test_a_text_is_shown_in_one_line():
-    assert shown('a ä 地\\') == 'a ä 地\\'
-    assert shown('a\n\r\t\x1b[2J\x7f\x9b\u202e\u2028\udcff') == (
-        r'a\n\r\t\x1b[2J\x7f\x9b\u202e\u2028\udcff'
-    )
+ESCAPED = {
+    'a\x1b[31m\nb': r'a\x1b[31m\nb',
+    os.fsdecode(b'a\xff\xfe'): r'a\udcff\udcfe',
+    'a$\\x_{$': 'a$\\x_{$',
+    '[a*]{0}%s': '[a*]{0}%s',
+    ' \u202e\u2028\x7f ä ': r' \u202e\u2028\x7f ä ',
+}
 
 
 @pytest.mark.usefixtures('compiled_code')
-@pytest.mark.parametrize(
-    'name', ['a\x1b[31m\nb', os.fsdecode(b'a\xff\xfe'), 'a$\\x_{$', '[a*]{0}%s', ' a ']
-)
+@pytest.mark.parametrize('name', ESCAPED)
 def test_any_name_is_read_written_and_shown_escaped(tmp_path, monkeypatch, capsys, name):
     monkeypatch.chdir(tmp_path)
     points = scan(n_ground=6000)
     points.tofile(f'{name}.bin')
     write_ros2_bag(tmp_path / f'{name}.mcap')
-    root = tmp_path / name
-    write_frame(root, name, 0, points, np.full(len(points), 40, '<u4'))
+    write_frame(tmp_path / name, name, 0, points, np.full(len(points), 40, '<u4'))
     (tmp_path / f'{name}.yaml').write_text('sensor: {height: 1.7}')
-    for words in (
-        ['segment', f'{name}.bin', '-o', f'{name}.label', '--config', f'{name}.yaml'],
-        ['segment', f'{name}.mcap', '-o', f'{name}_ground.mcap'],
-        ['segment', root, '-o', f'{name}_out'],
-        ['plot', 'scan', f'{name}.bin', '-o', f'{name}.svg'],
-        ['evaluate', f'{name}.mcap', '--against', f'{name}.yaml'],
-        ['config', 'check', f'{name}.yaml'],
+    for line in (
+        'segment|NAME.bin|-o|NAME.label|--config|NAME.yaml',
+        'segment|NAME.mcap|-o|NAME_ground.mcap',
+        'segment|NAME|-o|NAME_out',
+        'plot|scan|NAME.bin|-o|NAME.svg',
+        'evaluate|NAME.mcap|--against|NAME.yaml',
+        'config|check|NAME.yaml',
     ):
-        assert run(*words) == 0
+        assert run(*line.replace('NAME', name).split('|')) == 0
         said = capsys.readouterr()
-        assert all(line.isprintable() for line in (said.out + said.err).splitlines()), words
+        assert all(text.isprintable() for text in (said.out + said.err).splitlines()), line
     assert run('segment', f'{name}.bin', '-o', f'{name}.label') == 2
-    assert error_line(capsys) == f'{shown(name)}.label: exists already; --force replaces it'
+    expected = f'{ESCAPED[name]}.label: exists already; --force replaces it'
+    assert error_line(capsys) == expected
 
 
 @pytest.mark.parametrize(

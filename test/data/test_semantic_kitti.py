@@ -33,17 +33,21 @@ def test_points_come_back_bit_for_bit_and_labels_are_the_lower_half(
     assert labels.tolist() == [int(entry) % 65536 for entry in entries]
 
 
-def test_files_of_another_size_or_none_are_refused(tmp_path):
+@pytest.mark.parametrize(
+    ('n_points', 'name', 'message'),
+    [
+        (None, 'a.bin', '100 bytes is not a whole number of points'),
+        (24, 'a.bin', '100 bytes, expected 96 for 24 points'),
+        (26, 'a.bin', '100 bytes, expected 104 for 26 points'),
+        (None, 'missing.bin', 'No such file'),
+        (0, '', 'Is a directory'),
+    ],
+)
+def test_files_of_another_size_or_none_are_refused(tmp_path, n_points, name, message):
     (tmp_path / 'a.bin').write_bytes(bytes(100))
-    for call, name, message in (
-        (read_points, 'a.bin', '100 bytes is not a whole number of points'),
-        (lambda path: read_labels(path, 24), 'a.bin', '100 bytes, expected 96 for 24 points'),
-        (lambda path: read_labels(path, 26), 'a.bin', '100 bytes, expected 104 for 26 points'),
-        (read_points, 'missing.bin', 'No such file'),
-        (lambda path: read_labels(path, 0), '', 'Is a directory'),
-    ):
-        with pytest.raises(DataError, match=f'{tmp_path / name}: {message}'):
-            call(tmp_path / name)
+    path = tmp_path / name
+    with pytest.raises(DataError, match=f'{path}: {message}'):
+        read_points(path) if n_points is None else read_labels(path, n_points)
 
 
 def test_sequences_and_frames_are_sorted_and_need_scans(tmp_path):
@@ -76,6 +80,11 @@ def test_times_belong_to_the_numbers_of_the_files(tmp_path):
     times = tmp_path / 'sequences/00/times.txt'
     times.write_text('0.000000e+00\n1.036e-01\n2.1e-01\n3.2e-01\n')
     assert [frame.time for frame in list_frames(tmp_path, '00')] == [0.1036, 0.32]
+    (tmp_path / 'sequences/00/velodyne/000003.bin').rename(times.parent / 'velodyne/first.bin')
+    with pytest.raises(DataError, match=r'first\.bin.*number'):
+        list_frames(tmp_path, '00')
+    times.unlink()
+    assert len(list_frames(tmp_path, '00')) == 2
 
 
 @pytest.mark.parametrize(
@@ -98,13 +107,3 @@ def test_times_that_cannot_be_used_are_refused(tmp_path, content, message):
     with pytest.raises(DataError, match=message) as caught:
         list_frames(tmp_path, '00')
     assert str(caught.value).startswith(str(path))
-
-
-def test_scans_without_numbers_cannot_have_times(tmp_path):
-    write_streets(tmp_path, s00=1)
-    folder = tmp_path / 'sequences/00'
-    (folder / 'velodyne/000000.bin').rename(folder / 'velodyne/first.bin')
-    assert [frame.time for frame in list_frames(tmp_path, '00')] == [0.0]
-    (folder / 'times.txt').write_text('0.0\n')
-    with pytest.raises(DataError, match=r'first\.bin.*number'):
-        list_frames(tmp_path, '00')

@@ -13,8 +13,6 @@ from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.cloud_files import find_objection, read_file
 from gp_ground_seg.data.semantic_kitti import read_points
 
-COLUMNS = ('--columns', '5')
-
 
 def missing(points, share, value):
     """Some points without a return, in runs, as on the sky."""
@@ -95,8 +93,13 @@ def test_another_number_of_columns_is_seen_by_the_distances(scans, tmp_path, col
         points = points[: len(points) // 840 * 840]
         more = rng.uniform(0.0, 60.0, (len(points), 3)), np.zeros((len(points), 3))
         for extra in more:
-            np.hstack([points[:, :3], extra])[:, :columns].astype('<f4').tofile(path)
-            assert len(read_points(path, columns)) == len(points)
+            table = np.hstack([points[:, :3], extra])[:, :columns].astype('<f4')
+            table.tofile(path)
+            read = read_points(path, columns)
+            assert (read.dtype, read.flags.writeable) == (np.float32, True)
+            four = np.zeros((len(points), 4))
+            four[:, : min(columns, 4)] = table[:, :4]
+            np.testing.assert_array_equal(read, four)
             for wrong in {3, 4, 5, 6} - {columns, 2 * columns, columns // 2}:
                 n_wrong += 1
                 try:
@@ -127,55 +130,34 @@ def test_beams_in_turns_and_lost_returns_are_no_other_columns(tmp_path, sensor):
         np.testing.assert_array_equal(read_points(path), table)
 
 
-def test_columns_that_are_asked_for_are_read(tmp_path):
-    points, path = simulated('urban', seed=1).points, tmp_path / 'a.bin'
-    for n_columns in (3, 4, 5, 7):
-        table = np.zeros((len(points), n_columns), '<f4')
-        table[:, :4] = points[:, :n_columns]
-        table.tofile(path)
-        read = read_points(path, n_columns)
-        assert (read.dtype, read.flags.writeable) == (np.float32, True)
-        expected = points * np.float32([1, 1, 1, n_columns > 3])
-        np.testing.assert_array_equal(read, expected)
-
-
-@pytest.fixture
-def root(tmp_path):
-    """A SemanticKITTI folder with two sequences of one frame of five columns, labelled."""
+@pytest.mark.parametrize(
+    'command',
+    [
+        'segment SCAN -o OUT.label --force',
+        'segment ROOT/sequences/00 -o OUT --force',
+        'plot segment SCAN --azimuth 0 -o OUT.png',
+        'kitti-to-bag ROOT --sequence 00 OUT.mcap',
+        'evaluate ROOT --json OUT.json',
+    ],
+)
+def test_every_command_refuses_wrong_data_and_names_the_option(command, tmp_path, capsys):
     points = simulated('urban', 'hdl-32e', 1).points
     points = np.hstack([points, points[:, 3:]])[: len(points) // 20 * 20]
-    semantic = np.where(points[:, 2] < -1.5, 40, 10).astype('<u4')
-    for sequence in ('00', '01'):
-        write_frame(tmp_path / 'root', sequence, 0, points, semantic)
-    return tmp_path / 'root'
-
-
-COMMANDS = (
-    'segment SCAN -o OUT.label',
-    'segment ROOT/sequences/00 -o OUT',
-    'plot segment SCAN --azimuth 0 -o OUT.png',
-    'kitti-to-bag ROOT --sequence 00 OUT.mcap',
-    'evaluate ROOT --json OUT.json',
-)
-
-
-@pytest.mark.parametrize('command', COMMANDS)
-def test_every_command_refuses_wrong_data_and_names_the_option(command, root, capsys):
-    """And --force does not help."""
-    scan, out = root / 'sequences/00/velodyne/000000.bin', root.parent / 'out'
-    text = command.replace('SCAN', str(scan)).replace('ROOT', str(root))
-    words = text.replace('OUT', str(out)).split()
-    assert run(*words, *(['--force'] if 'segment' in words else [])) == 2
+    root, out = tmp_path / 'root', tmp_path / 'out'
+    write_frame(root, '00', 0, points, np.where(points[:, 2] < -1.5, 40, 10).astype('<u4'))
+    text = command.replace('SCAN', f'{root}/sequences/00/velodyne/000000.bin')
+    words = text.replace('ROOT', str(root)).replace('OUT', str(out)).split()
+    assert run(*words) == 2
     assert re.search(r'000000\.bin: read with 4 columns .*: use --columns 5$', error_line(capsys))
-    assert [path.name for path in root.parent.iterdir()] == ['root']
+    assert [path.name for path in tmp_path.iterdir()] == ['root']
     if words[0] == 'segment':
-        assert run(*words, *COLUMNS) == 0
+        assert run(*words, '--columns', '5') == 0
 
 
 def test_columns_are_for_files_of_scans_and_at_least_three(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write_ros2_bag(tmp_path / 'a.mcap')
-    assert run('segment', 'a.mcap', '-o', 'OUT.mcap', *COLUMNS) == 2
+    assert run('segment', 'a.mcap', '-o', 'OUT.mcap', '--columns', '5') == 2
     assert error_line(capsys) == '--columns: is for .bin scans, which a.mcap is not'
     assert [path.name for path in tmp_path.iterdir()] == ['a.mcap']
     for wrong in ('2', '-1', 'x'):

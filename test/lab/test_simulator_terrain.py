@@ -18,21 +18,15 @@ MAX_RANGE = 60.0
 SENSOR_POSITION = np.array([0.0, 0.0, 1.73])
 
 TERRAINS = {
-    'flat': landforms.flat(0.3),
-    'slope': landforms.slope(0.2, 0.7),
     'ramp': landforms.ramp(9.0, 0.15, 0.2),
-    'kerb': landforms.kerb(4.0, 0.15),
-    'kerb_vertical': landforms.kerb(4.0, 0.15, face_width=0.0),
-    'ditch': landforms.ditch(0.3, 8.0, 4.0, 1.5, 1.0),
-    'crest': landforms.crest(8.0, 10.0, 0.1, 6.0),
+    'vertical kerb': landforms.kerb(4.0, 0.15, face_width=0.0),
     'steps': polyline(0.0, [(3, 0), (3, 0.8), (3.3, -0.2), (5, -0.2), (12, 0.8), (12, -1)], 0.1),
-    'walls': polyline(2.0, [(3, -1), (10, -1), (10, 0.8), (10.3, 0.8), (10.3, 0)], -0.2),
     'rough': landforms.rough(np.random.default_rng(3), rms=0.2, wavelengths=(0.7, 9.0)),
-    'road_then_rubble': landforms.smooth_then_rough(np.random.default_rng(4), 9.0, 3.0),
-    'rough_kerb': landforms.Sum(
+    'rubble': landforms.smooth_then_rough(np.random.default_rng(4), 9.0, 3.0),
+    'rough kerb': landforms.Sum(
         (landforms.kerb(4.0, 0.15), landforms.rough(np.random.default_rng(5), 0.1, (0.7, 9.0)))
     ),
-    'ditch_across_crest': landforms.Sum(
+    'ditch across a crest': landforms.Sum(
         (landforms.ditch(1.3, 8.0, 4.0, 1.5, 1.0), landforms.crest(8.0, 10.0, 0.1, 6.0))
     ),
 }
@@ -121,21 +115,17 @@ def test_landform_heights(terrain, u, expected):
     np.testing.assert_allclose(terrain.height(np.array(u), np.zeros(len(u))), expected, atol=1e-12)
 
 
-def test_heights_of_a_sum_are_added():
-    parts = [TERRAINS[name] for name in ('ditch', 'rough', 'crest')]
-    x, y = np.random.default_rng(1).uniform(-40.0, 40.0, (2, 500))
-    total = landforms.Sum(tuple(parts))
-    np.testing.assert_allclose(total.height(x, y), sum(part.height(x, y) for part in parts))
-
-
 def test_waves_have_the_rms_asked_for_and_rubble_starts_where_the_road_ends():
     ground = landforms.rough(np.random.default_rng(9), 0.1, (1.0, 8.0))
     x, y = np.random.default_rng(10).uniform(-2000.0, 2000.0, (2, 50_000))
     assert np.std(ground.height(x, y)) == pytest.approx(0.1, rel=0.03)
-    ground = landforms.smooth_then_rough(np.random.default_rng(11), 20.0, 5.0, rms=0.15)
+    rubble = landforms.smooth_then_rough(np.random.default_rng(11), 20.0, 5.0, rms=0.15)
     x, y = np.random.default_rng(12).uniform(-50.0, 20.0, (2, 1000))
-    assert not ground.height(x, y).any()
-    assert np.std(ground.height(x + 120.0, y)) > 0.1
+    assert not rubble.height(x, y).any()
+    x += 120.0
+    assert np.std(rubble.height(x, y)) > 0.1
+    total = landforms.Sum((ground, rubble)).height(x, y)
+    np.testing.assert_allclose(total, ground.height(x, y) + rubble.height(x, y))
 
 
 def inside(solid, points):

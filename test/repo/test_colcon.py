@@ -13,7 +13,7 @@ pytest.importorskip('rclpy', reason='ROS is not installed')
 pytest.importorskip('colcon_core', reason='colcon is not installed')
 
 from conftest import REPOSITORY
-from ros_helpers import ISOLATION, NAMESPACE, Process
+from ros_helpers import NAMESPACE, Process
 
 pytestmark = pytest.mark.slow
 PACKAGE = 'gp_ground_seg'
@@ -28,21 +28,19 @@ ENVIRONMENT = {
 }
 
 
-def run(command, folder, **changes):
-    return subprocess.run(
-        command, cwd=folder, env={**ENVIRONMENT, **changes},
-        capture_output=True, text=True, timeout=1800.0,
-    )  # fmt: skip
-
-
-def colcon(folder, verb, *words, **changes):
-    """A verb of colcon over this source, all it makes in `folder`."""
-    command = [sys.executable, '-m', 'colcon', '--log-base', str(folder / 'log'), verb]
-    if verb != 'test-result':
-        command += ['--base-paths', str(REPOSITORY), '--packages-select', PACKAGE]
-        command += ['--install-base', str(folder / 'install')]
-        command += ['--build-base', str(folder / 'build')]
-    return run([*command, *words], folder, **changes)
+def build(folder, *words):
+    """Build this source, all that colcon makes in `folder`."""
+    command = [
+        sys.executable, '-m', 'colcon', '--log-base', folder / 'log', 'build',
+        '--base-paths', REPOSITORY, '--packages-select', PACKAGE,
+        '--install-base', folder / 'install', '--build-base', folder / 'build', *words,
+    ]  # fmt: skip
+    built = subprocess.run(
+        command, cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=1800.0
+    )
+    assert built.returncode == 0, built.stdout + built.stderr
+    assert '1 package finished' in built.stdout
+    return folder
 
 
 def sourced(folder, command, *words):
@@ -53,11 +51,7 @@ def sourced(folder, command, *words):
 
 @pytest.fixture(scope='module')
 def workspace(tmp_path_factory):
-    folder = tmp_path_factory.mktemp('workspace')
-    built = colcon(folder, 'build')
-    assert built.returncode == 0, built.stdout + built.stderr
-    assert '1 package finished' in built.stdout
-    return folder
+    return build(tmp_path_factory.mktemp('workspace'))
 
 
 def test_the_package_is_in_the_index_and_imported_from_the_workspace(workspace):
@@ -66,9 +60,8 @@ def test_the_package_is_in_the_index_and_imported_from_the_workspace(workspace):
         f'print(find("{PACKAGE}"), {PACKAGE}.__file__)'
     )
     command = sourced(workspace, f'{sys.executable} -c "$0"', script)
-    done = run(command, workspace, **ISOLATION)
-    assert done.returncode == 0, done.stderr
-    prefix, module = map(Path, done.stdout.split())
+    said = subprocess.check_output(command, cwd=workspace, env=ENVIRONMENT, text=True)
+    prefix, module = map(Path, said.split())
     assert prefix == workspace / 'install' / PACKAGE and prefix in module.parents
     installed = Path(prefix, 'share', PACKAGE)
     assert (installed / 'package.xml').read_bytes() == (REPOSITORY / 'package.xml').read_bytes()
@@ -102,6 +95,5 @@ def test_the_installed_node_runs_as_ros2_run_starts_it(workspace, tmp_path):
 
 
 def test_links_to_the_sources_are_installed_too(tmp_path):
-    built = colcon(tmp_path, 'build', '--symlink-install')
-    assert built.returncode == 0, built.stdout + built.stderr
+    build(tmp_path, '--symlink-install')
     assert os.access(tmp_path / 'install' / PACKAGE / 'lib' / PACKAGE / EXECUTABLE, os.X_OK)

@@ -54,21 +54,14 @@ def test_package_xml_is_that_of_this_package(package):
     assert launched <= depends | {'pathlib', 'yaml', PACKAGE}
 
 
-# The order that the schema of format 3 (REP 149) asks for.
-DEPENDENCIES = '(?:(?:build|build_export|buildtool|buildtool_export|exec|doc|test)_depend|depend)'
-IN_ORDER = re.compile(
-    'name version description (?:maintainer )+(?:license )+(?:url )*(?:author )*'
-    f'(?:{DEPENDENCIES} )*(?:group_depend )*(?:member_of_group )*(?:export )?'
-)
-
-
-def test_package_xml_follows_its_schema(package):
-    assert IN_ORDER.fullmatch(''.join(f'{element.tag} ' for element in package))
-    for element in package:
-        # A token: no space around it, none doubled, no line break.
-        if not len(element):
-            assert element.text == ' '.join(element.text.split())
-    names = [element.text for element in package if 'depend' in element.tag]
+def test_package_xml_has_its_elements_in_the_order_of_rep_149(package):
+    order = ['name', 'version', 'description', 'maintainer', 'license', 'url', 'author']
+    tags = [element.tag for element in package]
+    first = [tag for tag in tags if tag in order]
+    assert first == sorted(first, key=order.index) == tags[: len(first)]
+    depends = [k for k, tag in enumerate(tags) if tag.endswith('depend')]
+    assert tags[-1] == 'export' and depends == [*range(depends[0], len(tags) - 1)]
+    names = [package[k].text for k in depends]
     assert len(set(names)) == len(names)
 
 
@@ -149,21 +142,14 @@ def test_what_others_can_change_is_named_by_its_digest():
     assert dockerfile.index('USER 1000') < dockerfile.index('ENTRYPOINT')
 
 
-HINTS = ('require', 'install_hint')
-
-
-def required_packages():
-    """The second arguments of `require` and the arguments of `install_hint`, where literal."""
-    for tree in parse(REPOSITORY / PACKAGE).values():
-        for node in ast.walk(tree):
-            is_hint = isinstance(node, ast.Call) and ast.unparse(node.func) in HINTS
-            if is_hint and isinstance(node.args[-1], ast.Constant):
-                yield from shlex.split(node.args[-1].value)
-
-
 def test_what_hints_name_is_what_our_extras_install():
     """Names of other packages on PyPI, so that a hint works wherever ours comes from."""
-    named = {*required_packages(), *shlex.split(ROS_WHEELS)}
+    named = set(shlex.split(ROS_WHEELS))
+    for tree in parse(REPOSITORY / PACKAGE).values():
+        for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+            is_hint = ast.unparse(call.func) in ('require', 'install_hint')
+            if is_hint and isinstance(call.args[-1], ast.Constant):
+                named |= {*shlex.split(call.args[-1].value)}
     assert {'rosbags', 'numba', 'ros-jazzy-rclpy[fastrtps]'} <= named
     setup = (REPOSITORY / 'setup.py').read_text(encoding='utf-8')
     assert not {name for name in named if not re.search(rf"'{re.escape(name)}[<>=[;']", setup)}
@@ -182,41 +168,19 @@ def test_a_hint_says_where_pip_works(tmp_path, monkeypatch):
     assert install_hint('rosbags') == here
 
 
-def test_a_warning_is_an_error_in_tests_and_not_where_plugins_are_imported(tmp_path):
-    """One of launch_testing ended ``colcon test`` before the first test."""
-    found = tmp_path / 'early-1.0.dist-info'
-    found.mkdir()
-    (found / 'METADATA').write_text('Metadata-Version: 2.1\nName: early\nVersion: 1.0\n')
-    (found / 'entry_points.txt').write_text('[pytest11]\nearly = early\n')
-    warn = "import warnings\n{}warnings.warn('{}', DeprecationWarning)\n"
-    (tmp_path / 'early.py').write_text(warn.format('', 'early'))
-    (tmp_path / 'test_late.py').write_text(warn.format('def test_late(): ', 'late'))
-    words = '-c', REPOSITORY / 'pyproject.toml', '-p', 'conftest', tmp_path / 'test_late.py'
-    path = os.pathsep.join(map(str, [tmp_path, REPOSITORY / 'test', *sys.path]))
-    done = subprocess.run(
-        [sys.executable, '-m', 'pytest', *words], capture_output=True, text=True,
-        # The options that colcon passes so name modules: of this one, for ever.
-        env={**os.environ, 'PYTHONPATH': path, 'NUMBA_DISABLE_JIT': '1', 'PYTEST_ADDOPTS': ''},
-    )  # fmt: skip
-    assert done.returncode == 1 and 'DeprecationWarning: late' in done.stdout, done.stderr
-
-
-@pytest.mark.parametrize(
-    ('words', 'complaint'),
-    [
-        ((), 'no ROS 2: source /opt/ros/jazzy/setup.bash'),
-        (('src',), 'src has no src: name the workspace, or start this in it'),
-        (('elsewhere',), 'elsewhere: no such folder'),
-    ],
-)
-def test_the_script_for_a_workspace_refuses_in_one_line(tmp_path, words, complaint):
+def test_the_script_for_a_workspace_refuses_in_one_line(tmp_path):
     (tmp_path / 'src').mkdir()
     script = REPOSITORY / 'scripts' / 'setup_workspace.sh'
-    done = subprocess.run(
-        [script, *words], cwd=tmp_path, env={'PATH': os.environ['PATH']},
-        capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    assert line.startswith('setup_workspace.sh: error: ') and line.endswith(complaint)
+    for word, complaint in (
+        ('.', 'no ROS 2: source /opt/ros/jazzy/setup.bash'),
+        ('src', 'src has no src: name the workspace, or start this in it'),
+        ('elsewhere', 'elsewhere: no such folder'),
+    ):
+        done = subprocess.run(
+            [script, word], cwd=tmp_path, env={'PATH': os.environ['PATH']},
+            capture_output=True, text=True,
+        )  # fmt: skip
+        (line,) = done.stderr.splitlines()
+        assert done.returncode == 2 and line.startswith('setup_workspace.sh: error: ')
+        assert line.endswith(complaint)
     assert [path.name for path in tmp_path.rglob('*')] == ['src']

@@ -24,7 +24,6 @@ from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.pipeline.points import angles_of, rotation
 from gp_ground_seg.lab.simulation import VLP_16, simulate_scan
 from gp_ground_seg.ros import transforms
-from gp_ground_seg.ros.ground_model import read_ground_model
 from gp_ground_seg.ros.transforms import rotation_of
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
@@ -40,10 +39,10 @@ def quaternion(matrix):
     return Quaternion(x=x, y=y, z=z, w=w)
 
 
-def turned_street(yaw=0.0):
+def turned_street():
     """A street seen by a tilted sensor: structured points, and the rotation to the level frame."""
     points = street(6000)
-    turn = Rotation.from_euler('z', yaw).as_matrix() @ rotation(*TILT)
+    turn = Rotation.from_euler('z', 1.0).as_matrix() @ rotation(*TILT)
     return ros.moved(points, xyz_of(points).astype(np.float64) @ turn), turn
 
 
@@ -78,31 +77,6 @@ def test_tilt_of_a_quaternion_is_roll_and_pitch_whatever_the_heading(roll, pitch
 def test_what_is_no_rotation_is_refused(w):
     with pytest.raises(PointCloudError, match='quaternion'):
         rotation_of(Quaternion(x=0.0, w=w))
-
-
-def test_given_tilt_levels_and_leaves_the_points_as_they_are():
-    points, _ = turned_street()
-    message = to_message(points, stamp=(3, 4), frame='tilted_lidar')
-    tilt = {'sensor.roll': TILT[0], 'sensor.pitch': TILT[1]}
-    with bench(*ros.given({**VALUES, **tilt})) as b:
-        model = b.listen('~/ground_model')
-        parts = b.segment(message)
-        cloud = model.wait(1)[0]
-        if not HAS_TF2:
-            # Asked for live it is refused, and the node goes on.
-            assert 'needs tf2_ros' in b.refusal('frame.level', 'tf')
-            assert b.node.config.frame.level == 'sensor'
-            assert not b.set('frame.base', 'two words').successful
-            assert b.set('frame.base', 'base_footprint').successful
-            b.segment(message)
-    check_levelled(points, message, parts)
-    # The model lies in the frame of the cloud, on its points of ground.
-    assert cloud.header == message.header
-    model = read_ground_model(cloud)
-    np.testing.assert_allclose((model.roll, model.pitch), TILT, atol=1e-6)
-    is_ground = SEGMENTER.segment(xyz_of(points), TILT).label == Label.GROUND
-    off = np.abs(points['z'] - model.at(points['x'], points['y'])[0])[is_ground]
-    assert np.nanmedian(off) < 0.05
 
 
 class StandInBuffer:
@@ -151,7 +125,7 @@ def stand_in(monkeypatch):
 
 @pytest.mark.usefixtures('stand_in')
 def test_tilt_by_tf_is_as_good_as_given():
-    points, turn = turned_street(yaw=1.0)
+    points, turn = turned_street()
     by_tf = {**VALUES, 'frame.level': 'tf', 'diagnostics.period': 0.1}
     with bench(*ros.given(by_tf)) as b:
         # Not known yet: refused with the names of both frames, and the node goes on.
@@ -193,7 +167,7 @@ def test_clouds_wait_for_the_transform_of_their_stamp(monkeypatch):
     monkeypatch.setattr(StandInBuffer, 'newest', 2)
     way = 'base_link', 'tilted_lidar'
     monkeypatch.setattr(StandInBuffer, 'known', {way: quaternion(rotation(1.0, 0.5))})
-    points, turn = turned_street(yaw=1.0)
+    points, turn = turned_street()
     values = {**VALUES, 'frame.level': 'tf'}
     values[f'qos_overrides.{ros.NAMESPACE}/points.subscription.depth'] = 5
     with bench(*ros.given(values)) as b:
@@ -238,7 +212,7 @@ def test_place_of_the_sensor_by_tf():
 
 @pytest.mark.usefixtures('stand_in')
 def test_the_crop_box_is_in_the_base_of_tf(monkeypatch):
-    points, turn = turned_street(yaw=1.0)
+    points, turn = turned_street()
     place = np.array([0.5, -0.3, 1.73])
     box = np.array([-9.0, 9.0, -5.0, 6.0, -0.5, 2.0])
     monkeypatch.setattr(StandInBuffer, 'known', {('base_link', 'tilted_lidar'): quaternion(turn)})
@@ -283,7 +257,7 @@ BY_IMU = {**VALUES, 'frame.level': 'imu', 'diagnostics.period': 0.1}
 
 
 def test_tilt_by_an_imu(monkeypatch):
-    points, turn = turned_street(yaw=1.0)
+    points, turn = turned_street()
     with bench(*ros.given(BY_IMU)) as b:
         imu = ImuProbe(b, points)
         imu.check_refused(f'no message on {ros.NAMESPACE}/imu, for frame.level = imu', 2)
@@ -313,7 +287,7 @@ def test_tilt_by_an_imu(monkeypatch):
 
 @pytest.mark.usefixtures('stand_in')
 def test_tilt_by_an_imu_in_another_frame():
-    points, turn = turned_street(yaw=1.0)
+    points, turn = turned_street()
     mount = rotation(-1.2, 0.7)
     StandInBuffer.known['imu_link', 'tilted_lidar'] = quaternion(mount)
     with bench(*ros.given(BY_IMU)) as b:
@@ -326,7 +300,7 @@ def test_tilt_by_an_imu_in_another_frame():
 def test_tilt_by_real_tf():
     from tf2_ros import StaticTransformBroadcaster
 
-    points, turn = turned_street(yaw=1.0)
+    points, turn = turned_street()
     message = to_message(points, stamp=(3, 4), frame='tilted_lidar')
     with bench(*ros.given({**VALUES, 'frame.level': 'tf'})) as b:
         broadcaster = StaticTransformBroadcaster(b.probe)

@@ -7,7 +7,6 @@ import time
 import numpy as np
 import pytest
 import ros_helpers as ros
-import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock_type import ClockType
 from rclpy.logging import LoggingSeverity
@@ -42,17 +41,6 @@ def test_reliability_asked_for_is_kept(reliability):
         assert (said in status.message) == (reliability == 'reliable')
 
 
-def test_what_is_dumped_pins_no_reliability(tmp_path):
-    with ros.started_node('-r', f'__ns:={NAMESPACE}') as node:
-        values = {name: p.value for name, p in node.get_parameters_by_prefix('').items()}
-    assert f'qos_overrides.{NAMESPACE}/points.subscription.reliability' in values
-    path = tmp_path / 'dumped.yaml'
-    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
-    with ros.bench('--params-file', str(path)) as b:
-        b.publisher = b.probe.create_publisher(PointCloud2, 'points', ros.BEST_EFFORT)
-        b.publish_until(to_message(street(1000)), lambda: b.ground.messages, 'answer')
-
-
 def test_a_lazy_node_listens_only_while_somebody_listens_to_it():
     message = to_message(street(1000))
     with ros.bench('-p', 'input.lazy:=true', '-p', 'diagnostics.stale_after:=0.5', *OFTEN) as b:
@@ -80,22 +68,6 @@ def test_a_lazy_node_listens_only_while_somebody_listens_to_it():
         b.publisher.publish(message)  # one: clouds every few milliseconds fill the queue
         labelled.wait(1)
         b.wait_for_status('processing', lambda v, _: v['Dropped since startup'] == '0')
-
-
-# Names are part of the interface: dashboards read tasks, keys and their order.
-STAGES = 'queue grid pose faces lines learning surface label total publish'
-KEYS = {
-    'input': 'Topic; Publishers; QoS; Events since startup; Events in window; Duration of window '
-    '(s); Actual frequency (Hz); Time since last cloud (s); Age of last stamp (s); Clock; '
-    'Time jumps since startup; Frame; Fields; Refused since startup; Last error',
-    'processing': 'Clouds since startup; Dropped since startup; Median latency (ms); Backend',
-    'model': 'Segments with a model; Ground fraction; Unknown fraction; Points without a return; '
-    'Fraction without model; Candidates; Inliers; '
-    'Sensor height (m); Sensor roll (rad); Sensor pitch (rad); Taken from the scan; '
-    'Estimated height (m); Estimated roll (rad); Estimated pitch (rad); Noise (m); '
-    'Learning mode; Learned since startup; Optimiser status; Evaluations; At bound; '
-    'Objective per candidate',
-}
 
 
 def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(tmp_path):
@@ -129,13 +101,9 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(tmp_path):
     for status in tasks.values():
         assert (status.level, status.hardware_id) == (DiagnosticStatus.OK, node_name)
     values = {task: ros.values_of(status) for task, status in tasks.items()}
-    for task, keys in KEYS.items():
-        assert [key for key in values[task] if not key.startswith('theta ')] == keys.split('; ')
-    assert 'theta sigma_n' in values['model']
     outputs = (f'{node_name}/{name}' for name in ('labeled', 'ground_model', 'scan', 'occupancy'))
     topics = f'{NAMESPACE}/ground', f'{NAMESPACE}/obstacles', *outputs
-    facts = ('subscribers', 'rate (Hz)', 'since startup')
-    assert [*values['output']] == [f'{topic} {fact}' for topic in topics for fact in facts]
+    assert [key.split()[0] for key in values['output']][::3] == [*topics]
     # A stamp of 2011 is old, and nothing is wrong with that.
     assert float(values['input']['Age of last stamp (s)']) > 1e8
     expected = {'Fields': ' '.join(ros.POINT.names), 'QoS': 'reliable, keep_last 1, volatile'}
@@ -175,20 +143,36 @@ def test_simulated_time_that_jumps_back_is_counted_once():
         assert wait_for_input('Events since startup', '3')['Time jumps since startup'] == '1'
 
 
-def test_drops_are_counted_exactly():
+@pytest.mark.parametrize('n_publishers', [1, 2])
+def test_drops_are_counted_exactly(n_publishers):
     message = to_message(street(20_000))
     depth = f'qos_overrides.{NAMESPACE}/points.subscription.depth:=1'
     with ros.bench(*OFTEN, '-p', depth) as b:
-        b.segment(message)
+        publishers = [b.publisher]
+        if n_publishers == 2:
+            publishers.append(b.probe.create_publisher(PointCloud2, 'points', ros.RELIABLE))
+        b.wait_for_status('input', lambda v, _: v['Publishers'] == str(n_publishers))
+
+        def send_one_by_one():
+            for publisher in publishers:
+                ros.wait_for(lambda p=publisher: p.get_subscription_count() == 1, 'subscription')
+                n_answers = len(b.ground.messages)
+                publisher.publish(message)
+                b.ground.wait(n_answers + 1)
+
+        send_one_by_one()  # the first cloud of a publisher opens its count
         for _ in range(29):
-            b.publisher.publish(message)
-
-        def all_accounted_for(values, _status):
-            return int(values['Clouds since startup']) + int(values['Dropped since startup']) == 30
-
-        values = ros.values_of(b.wait_for_status('processing', all_accounted_for))
-        assert int(values['Dropped since startup']) > 0
-        assert int(values['Clouds since startup']) == len(b.ground.wait(2))
+            for publisher in publishers:
+                publisher.publish(message)
+        # What a publisher has lost at the end is known with its next cloud.
+        for n_rounds in range(31, 50):
+            send_one_by_one()
+            values = ros.values_of(b.wait_for_status('processing', lambda *_: True))
+            n_dropped = int(values['Dropped since startup'])
+            if int(values['Clouds since startup']) + n_dropped == n_rounds * n_publishers:
+                break
+        assert n_rounds * n_publishers == n_dropped + len(b.ground.messages)
+        assert n_dropped > 0
 
 
 def test_nothing_is_loaded_for_numpy():
@@ -332,7 +316,8 @@ def test_times_of_the_stages_are_logged_at_level_debug(b, tmp_path):
         log = stderr.read_text()
     (times,) = re.findall(r'times of the stages \[ms\]: (.*)', log)
     names, numbers = zip(*(part.split() for part in times.split(', ')), strict=True)
-    assert sorted(names) == sorted(STAGES.split())
+    stages = 'queue grid pose faces lines learning surface label total publish'
+    assert sorted(names) == sorted(stages.split())
     assert sum(map(float, numbers)) > 0.0
 
 

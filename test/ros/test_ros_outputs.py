@@ -6,19 +6,18 @@ import numpy as np
 import pytest
 import ros_helpers as ros
 from nav_msgs.msg import OccupancyGrid
-from ros_helpers import said_by, stderr_in, street, to_message, wait_for, xyz_of
+from ros_helpers import street, to_message, wait_for, xyz_of
 from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.core.pipeline.points import single_precision
+from gp_ground_seg.core.pipeline.points import rotation, single_precision
 from gp_ground_seg.data import costmap
 from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_columns, read_xyz
 from gp_ground_seg.ros import outputs
 from gp_ground_seg.ros.ground_model import read_ground_model
 from gp_ground_seg.ros.outputs import LABELLED_FIELDS as FIELDS
-from gp_ground_seg.ros.outputs import labelled_names
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -44,62 +43,53 @@ def received(b, topic, message):
     return answer
 
 
-def test_names_that_the_input_has_already_are_said_once(b, tmp_path):
-    with stderr_in(tmp_path) as stderr:
-        message = to_message(street(500))
-        message.fields[0].name = 'label'
-        for _ in range(2):
-            found = received(b, '~/labeled', message)
-            assert [field.name for field in found.fields][-6:] == ['gp_label', *FIELDS[1:]]
-        assert said_by(stderr, 'in ~/labeled ours is gp_label').count('gp_label') == 1
-
-
-def test_names_are_free_however_often_a_cloud_comes_round():
-    taken = ['x', 'y', 'z']
-    for _ in range(3):
-        names = labelled_names(taken)
-        assert list(names) == list(FIELDS)
-        assert not set(names.values()) & set(taken)
-        assert len(set(names.values())) == len(FIELDS)
-        taken += names.values()
-
-
 def test_ground_model_gives_the_height_anywhere(b):
+    tilt = {'sensor.roll': 0.35, 'sensor.pitch': -0.2}
     points = street(6000)
+    points = ros.moved(points, xyz_of(points).astype(np.float64) @ rotation(*tilt.values()))
     message = to_message(points, stamp=(17, 23), frame='velo_link')
-    found = received(b, '~/ground_model', message)
+    with b.changed(tilt):
+        found = received(b, '~/ground_model', message)
     assert found.header == message.header
     assert (found.height, found.width) == (CONFIG.grid.n_segments, CONFIG.grid.n_bins + 1)
     names = ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')
     layout = [(field.name, field.datatype, field.count) for field in found.fields]
     assert layout == [(name, PointField.FLOAT32, 1) for name in names]
-    expected = GroundSegmenter(CONFIG).segment(xyz_of(points))
-    height, std = read_ground_model(found).at(points['x'], points['y'])
+    expected = GroundSegmenter(CONFIG.replace(**tilt)).segment(xyz_of(points))
+    assert (expected.label == Label.GROUND).sum() > 3000
+    model = read_ground_model(found)
+    np.testing.assert_allclose((model.roll, model.pitch), (0.35, -0.2), atol=1e-6)
+    height, std = model.at(points['x'], points['y'])
     np.testing.assert_allclose(height, expected.ground_z, rtol=0, atol=1e-4)
     np.testing.assert_allclose(std, expected.ground_std, rtol=0, atol=1e-4)
-    columns = read_columns(found, ['range', 'roll', 'pitch'])
-    assert np.isfinite(columns['range']).all()
-    assert not columns['roll'].any()
+    assert np.isfinite(read_columns(found, ['range'])['range']).all()
 
 
 REDUCED = {
-    'output.min_height': 0.3, 'output.max_height': 1.2, 'output.cell_size': 0.25,
-    'output.grid_size': 30.0, 'grid.r_max': 80.0,
+    'output.min_height': 0.3, 'output.max_height': 1.2, 'output.max_step_down': 0.2,
+    'output.cell_size': 0.25, 'output.grid_size': 30.0, 'grid.r_max': 80.0,
 }  # fmt: skip
+
+
+def street_with_drop():
+    """A street, and in front of the sensor ground in rings that is 0.6 m lower from x = 6 m on."""
+    rings, azimuth = np.meshgrid(np.geomspace(3.5, 30.0, 60), np.linspace(-0.7, 0.7, 320))
+    x, y = rings * np.cos(azimuth), rings * np.sin(azimuth)
+    scale = np.where(x > 6.0, (1.73 + 0.6) / 1.73, 1.0)
+    front = np.stack([scale * x, scale * y, -1.73 * scale], axis=-1).reshape(-1, 3)
+    others = street(8000)
+    others = others[abs(np.arctan2(others['y'], others['x'])) > 0.7]
+    return ros.moved(street(len(front) + len(others)), np.vstack([front, xyz_of(others)]))
 
 
 @pytest.fixture
 def reduced(b):
-    """Segmented cloud under `REDUCED`, which the node has from now on, and its message."""
-    message = to_message(street(8000, n_invalid=50), stamp=(17, 23), frame='velo_link')
+    """A cloud as a message, and what the node makes of it under `REDUCED`."""
+    message = to_message(street_with_drop(), stamp=(17, 23), frame='velo_link')
+    config = CONFIG.replace(**REDUCED)
+    found = SegmentedCloud(message, GroundSegmenter(config).segment(read_xyz(message)), config)
     with b.changed(REDUCED):
-        yield message, segmented(message, REDUCED)
-
-
-def segmented(message, changes):
-    """What is published of a cloud under other parameters."""
-    config = CONFIG.replace(**changes)
-    return SegmentedCloud(message, GroundSegmenter(config).segment(read_xyz(message)), config)
+        yield message, found
 
 
 def test_obstacles_are_those_between_the_heights(b, reduced):
@@ -118,19 +108,16 @@ def test_scan_is_what_a_costmap_takes(b, reduced):
     message, expected = reduced
     found = received(b, '~/scan', message)
     assert found.header == message.header
-    ranges = np.array(found.ranges, np.float32)
-    places = (
-        expected.places(expected.is_obstacle),
-        expected.places(expected.segmentation.label != Label.UNKNOWN),
-    )
-    np.testing.assert_array_equal(ranges, costmap.scan_ranges(*places))
+    ranges, blocked = np.array(found.ranges, np.float32), expected.blocked
+    returns = expected.places(expected.segmentation.label != Label.UNKNOWN)
+    np.testing.assert_array_equal(ranges, costmap.scan_ranges(blocked, returns))
     assert found.range_min == 0.0 and found.range_max == 80.0
     assert len(ranges) * found.angle_increment == pytest.approx(2.0 * np.pi)
-    # As laser_geometry places them: each on an obstacle of its direction.
+    # As laser_geometry places them: each on an obstacle or an edge of its direction.
     hit = np.isfinite(ranges)
     angle = found.angle_min + found.angle_increment * np.flatnonzero(hit)
     x, y = ranges[hit] * np.cos(angle), ranges[hit] * np.sin(angle)
-    apart = np.hypot(*(a[:, None] - p for a, p in zip((x, y), places[0], strict=True)))
+    apart = np.hypot(*(a[:, None] - p for a, p in zip((x, y), blocked, strict=True)))
     assert hit.sum() > 300 and (apart.min(axis=1) / ranges[hit]).max() < np.pi / len(ranges) + 1e-6
 
 
@@ -143,37 +130,12 @@ def test_occupancy_is_what_a_costmap_takes(b, reduced):
     assert (info.origin.position.x, info.origin.position.y) == (-15.0, -15.0)
     assert info.origin.orientation.w == 1.0
     cells = np.array(found.data, np.int8).reshape(120, 120)
-    assert set(np.unique(cells)) == {-1, 0, 100}
-    for chosen, value in ((expected.is_obstacle, 100), (expected.is_ground, 0)):
-        column, row = (np.floor((p + 15.0) / 0.25).astype(int) for p in expected.places(chosen))
+    assert set(np.unique(cells)) == {-1, 0, 100} and len(expected.edges) > 100
+    for places, value in ((expected.blocked, 100), (expected.places(expected.is_ground), 0)):
+        column, row = (np.floor((p + 15.0) / 0.25).astype(int) for p in places)
         inside = (abs(column - 59.5) < 60) & (abs(row - 59.5) < 60)
         at = cells[row[inside], column[inside]]
         assert np.isin(at, (value, 100)).all() and (at == value).mean() > 0.9
-
-
-def test_points_in_the_crop_box_are_in_no_output(b):
-    points = street(6000)
-    for axis in 'xy':
-        points[axis][:500] *= 0.02  # of the robot itself
-    points['z'][:500] = np.linspace(-1.5, 0.5, 500)
-    box = [-1.0, 1.0, -1.0, 1.0, -1.6, 0.6]
-    message = to_message(points, stamp=(17, 23), frame='velo_link')
-    rows, outside = ros.rows_of(message), range(500, len(points))
-    assert not b.set('input.crop_box', [1.0, -1.0, *box[2:]]).successful
-    assert np.nanmin(received(b, '~/scan', message).ranges) < 1.0
-    with b.changed({'input.crop_box': str([-1, *box[1:]])}):  # as ros2 param set sends it
-        assert b.node.config.input.crop_box == tuple(box)
-        parts = b.segment(message)
-        scan, grid, labelled = (
-            received(b, topic, message) for topic in ('~/scan', '~/occupancy', '~/labeled')
-        )
-    found = sorted(row for part in parts for row in ros.rows_of(part))
-    assert found == sorted(rows[k] for k in outside)
-    assert np.nanmin(scan.ranges) > 2.9
-    cells = np.array(grid.data, np.int8).reshape(400, 400)
-    assert not (cells[180:220, 180:220] == 100).any()
-    label = read_columns(labelled, ['label'])['label'].ravel()
-    np.testing.assert_array_equal(np.flatnonzero(label == Label.UNKNOWN), np.arange(500))
 
 
 def test_the_time_of_a_scan_is_that_between_clouds(b):
@@ -188,55 +150,28 @@ def test_the_time_of_a_scan_is_that_between_clouds(b):
     assert [scan.scan_time for scan in collector.messages[1:]] == pytest.approx([0.1, 0.0])
 
 
-def test_scan_and_occupancy_have_the_edges_of_drops(b):
-    """Ground that goes on 0.6 m lower from x = 6 m on."""
-    rings, azimuth = np.meshgrid(np.geomspace(3.5, 30.0, 60), np.linspace(-np.pi, np.pi, 1440))
-    behind = rings * np.cos(azimuth) > 6.0
-    scale = np.where(behind, (1.73 + 0.6) / 1.73, 1.0).ravel()
-    points = street(scale.size)
-    points['x'] = scale * (rings * np.cos(azimuth)).ravel()
-    points['y'] = scale * (rings * np.sin(azimuth)).ravel()
-    points['z'] = -1.73 * scale
-    message = to_message(points, stamp=(17, 23), frame='velo_link')
-    changes = {'output.max_step_down': 0.2}
-    with b.changed(changes):
-        scan, grid = (received(b, topic, message) for topic in ('~/scan', '~/occupancy'))
-    expected = segmented(message, changes)
-    x, y = expected.blocked
-    assert len(expected.edges) > 100
-    returns = expected.places(expected.segmentation.label != Label.UNKNOWN)
-    np.testing.assert_array_equal(scan.ranges, costmap.scan_ranges((x, y), returns))
-    cells = np.array(grid.data, np.int8).reshape(400, 400)
-    column, row = (np.floor((p + 20.0) / 0.1).astype(int) for p in (x, y))
-    inside = abs(row - 200) < 199
-    assert (cells[row[inside], column[inside]] == 100).all()
-    # The ground before it stays free.
-    assert (cells[180:220, 240:254] == 0).all()
-
-
 def test_nothing_is_built_that_nobody_subscribes_to(b, monkeypatch):
     built = []
 
     def counted(output):
-        def build(*arguments):
+        def build(segmented):
             built.append(output.topic)
-            return output.build(*arguments)
+            return output.build(segmented)
 
         return output._replace(build=build)
 
-    # The label output is told from the others by identity; see that the count is right anyway.
     rows = [(counted(output), publisher) for output, publisher in b.node._outputs._publishers]
     monkeypatch.setattr(b.node._outputs, '_publishers', rows)
     message = to_message(street(500))
     for topic in OPTIONAL:
-        built.clear()
         received(b, topic, message)
         assert built == ['ground', 'obstacles', topic]
         publisher = next(p for o, p in rows if o.topic == topic)
-        wait_for(lambda p=publisher: p.get_subscription_count() == 0, 'nobody')
+        wait_for(lambda p=publisher: p.get_subscription_count() == 0, 'end of the subscription')
         built.clear()
         b.segment(message)
         assert built == ['ground', 'obstacles']
+        built.clear()
 
 
 def test_quality_of_service_of_every_output_can_be_overridden():
@@ -267,11 +202,11 @@ CASES = {
 def cloud_of(code, shape, padding, share):
     """Message with gaps and further fields, coordinates (N, 3), and the bytes of each point."""
     rng, (height, width) = np.random.default_rng(0), shape
-    names = ['ring', 'z', 'label', 'x', 'réflexion', 'y', 'height']
-    others = {'ring': 'u2', 'label': 'u1', 'réflexion': 'f8', 'height': 'i4'}
+    names = ['ring', 'z', 'label', 'x', 'réflexion', 'y', 'height', 'gp_label']
+    others = {'ring': 'u2', 'label': 'u1', 'réflexion': 'f8', 'height': 'i4', 'gp_label': 'u1'}
     formats = [code[0] + others.get(name, code[1:]) for name in names]
-    layout = {'names': names, 'formats': formats, 'offsets': [*range(3, 80, 11)]}
-    dtype = np.dtype({**layout, 'itemsize': 82})
+    layout = {'names': names, 'formats': formats, 'offsets': [*range(3, 91, 11)]}
+    dtype = np.dtype({**layout, 'itemsize': 93})
     raw = rng.integers(0, 256, (height * width, dtype.itemsize), dtype=np.uint8)
     points = raw.view(dtype)[:, 0]
     source = ros.street(len(points))
@@ -311,7 +246,7 @@ def test_every_byte_comes_through_with_labels_as_of_the_library(b, case):
         assert getattr(whole, name) == getattr(message, name)
     assert whole.row_step == message.width * whole.point_step
     assert whole.fields[: len(message.fields)] == message.fields
-    names = list(labelled_names(field.name for field in message.fields).values())
+    names = ['gp_gp_label', 'gp_height', *FIELDS[2:]]  # the input has the others
     assert [field.name for field in whole.fields[len(message.fields) :]] == names
     raw = np.frombuffer(whole.data, np.uint8).reshape(len(rows), whole.point_step)
     assert [row[: message.point_step].tobytes() for row in raw] == rows

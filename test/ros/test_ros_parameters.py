@@ -112,6 +112,7 @@ def test_a_change_takes_effect_with_the_next_cloud(b, tmp_path):
         ('grid.n_segments', 90.0, 'grid.n_segments = 90.0: must be an integer in [4, 2048]'),
         ('runtime.backend', 'gpu', "runtime.backend = 'gpu': must be one of auto, numba, numpy"),
         ('grid.r_max', 1.5, 'grid.r_min = 2: must be below grid.r_max = 1.5'),
+        ('input.crop_box', [1.0, -1.0, 0.0, 1.0, 0.0, 1.0], 'must be none or six numbers in ['),
         ('lable.ground_tolerance', 0.1, 'did you mean label.ground_tolerance?'),
     ],
 )
@@ -170,6 +171,12 @@ def test_an_integer_is_taken_for_any_number(b, setter):
         assert b.node.config[name] == value
 
 
+def test_a_box_may_come_as_text(b):
+    """As ``ros2 param set`` sends whole numbers among others."""
+    assert b.set('input.crop_box', '[-1, 1.0, -1.0, 1.0, -1.6, 0.6]').successful
+    assert b.node.config.input.crop_box == (-1.0, 1.0, -1.0, 1.0, -1.6, 0.6)
+
+
 def test_a_fault_in_the_check_is_answered_and_the_node_lives(b, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(b.node, 'check_config', lambda _config: 1 / 0)
@@ -223,6 +230,7 @@ def started_with(path):
     namespace, name = ros.NAMESPACE, ros.NODE_NAME
     words = '-r', f'__ns:={namespace}', '-r', f'__node:={name}', '--params-file', str(path)
     with ros.started_node(*words) as node:
+        assert not node._input._is_pinned  # it follows the publishers, as without a file
         return node.config
 
 

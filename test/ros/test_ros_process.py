@@ -173,32 +173,6 @@ def test_every_cloud_comes_however_the_publishers_change(link):
     send_and_wait(link, LARGE, reliable)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize('qos', [RELIABLE, BEST_EFFORT])
-def test_losses_of_two_publishers_are_counted(link, qos):
-    first = add_publisher(link, RELIABLE, 'reliable')
-    used = 'reliable' if qos is RELIABLE else 'best_effort'
-    second = add_publisher(link, qos, used, 2)
-    before = counts(link)
-    message = to_message(street(2000))
-    for n_clouds in (1, 40, 1):
-        for _ in range(n_clouds):
-            first.publish(message)
-            second.publish(message)
-        n_dropped, n_processed = counts_when_quiet(link)
-    assert n_dropped - before[0] > 20
-    assert n_dropped + n_processed - sum(before) == 2 * 42
-
-
-def counts_when_quiet(link):
-    """The counts, once a second has brought no answer."""
-    while True:
-        n_answers, start = len(link.ground.messages), len(link.diagnostics.messages)
-        link.diagnostics.wait(start + 5)
-        if 0 < n_answers == len(link.ground.messages):
-            return counts(link)
-
-
 def test_large_clouds_that_come_best_effort_are_a_warning(node, link):
     link.publisher = add_publisher(link, BEST_EFFORT, 'best_effort')
     link.publish_until(LARGE, lambda: len(link.ground.messages) >= 2, 'answer')
@@ -240,15 +214,12 @@ def test_messages_of_another_type_are_named(node, link):
     assert '[WARN]' in line and f'on {NAMESPACE}/points' in line
 
 
-@given(st.lists(st.booleans(), min_size=1))
-def test_gaps_count_what_is_missing_between_arrivals(is_received):
+def test_gaps_are_those_in_the_numbers_of_one_publisher():
+    """Of another one, which counts from 1, and of a middleware without numbers, none is known."""
     gaps = SequenceGaps()
-    counted = sum(gaps.note(k) for k, received in enumerate(is_received, 1) if received)
-    inner = ''.join('x' if received else '.' for received in is_received).strip('.')
-    assert counted == inner.count('.')
-    # Another publisher counts from the start.
-    gaps.reset()
     assert [gaps.note(n) for n in (7, 8, 1, 2, 5, None, 200)] == [0, 0, 0, 0, 2, 0, 0]
+    gaps.reset()
+    assert [gaps.note(n) for n in (3, 5)] == [0, 1]
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 5)), max_size=50), st.booleans())
@@ -296,10 +267,3 @@ def test_best_effort_driver_with_the_large_segment_profile(node, tmp_path):
         # Fast DDS only warns about a profile that it cannot read, and goes on without.
         assert 'XML' not in driver.log
     assert 'points (best_effort' in node.log
-
-
-@pytest.mark.usefixtures('node')
-def test_a_best_effort_subscriber_is_served():
-    with ros.linked(BEST_EFFORT, BEST_EFFORT) as link:
-        answers = link.ground.messages, link.obstacles.messages
-        link.publish_until(to_message(street(500)), lambda: all(answers), 'clouds')

@@ -11,7 +11,6 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.data.costmap import SegmentedCloud
-from gp_ground_seg.lab.plotting import COLOURS, HEIGHTS
 
 NODE = '/ground_segmentation_node'
 KINDS = {'scan': 'LaserScan', 'occupancy': 'Map'}
@@ -65,17 +64,6 @@ def test_fields_are_those_of_the_messages():
     assert (f'{NODE}/labeled', 'label') in shown
     for topic, field in shown:
         assert field in {one.name for one in made[topic.replace(NODE, '~')].fields}
-
-
-def test_colours_are_those_of_the_pictures():
-    for topic, name in (('/ground', 'ground'), ('/obstacles', 'obstacle')):
-        (shown,) = (display for display in DISPLAYS if display['Topic']['Value'] == topic)
-        assert [*map(int, shown['Color'].split(';'))] == [*bytes.fromhex(COLOURS[name][1:])]
-        assert PANEL[topic]['flatColor'] == f'{COLOURS[name].lower()}ff'
-    (heights,) = (one for one in DISPLAYS if one.get('Channel Name') == 'height')
-    assert (heights['Min Intensity'], heights['Max Intensity']) == HEIGHTS
-    labeled = PANEL[f'{NODE}/labeled']
-    assert (labeled['minValue'], labeled['maxValue']) == HEIGHTS
 
 
 def snippets(page):

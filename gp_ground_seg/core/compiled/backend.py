@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from gp_ground_seg.core.compiled import (
@@ -10,43 +12,42 @@ from gp_ground_seg.core.compiled import (
     ground_plane,
     labels,
     learning,
-    lines,
     polar_grid,
 )
 from gp_ground_seg.core.compiled import relief as relief_
 from gp_ground_seg.core.compiled import vertical_faces as faces_
 from gp_ground_seg.core.frame import (
-    BoolArray,
     Candidates,
     Faces,
     FloatArray,
     Frame,
     GroundSurface,
     Labelled,
-    Lines,
     PointArray,
     PolarGrid,
-    PseudoInputs,
     Scan,
     Tiles,
 )
 from gp_ground_seg.core.gp.evidence import ODDS, uses_neighbours_in
 from gp_ground_seg.core.gp.latent import given_log_length_scales
 from gp_ground_seg.core.gp.learning import Learned, given_theta, theta_space
+from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.number_tuples import numbers_of
-from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.labels import depth_of_ground, lowest_of, sum_units
-from gp_ground_seg.core.pipeline.lines import lines_through
-from gp_ground_seg.core.pipeline.points import Direction, in_columns
+from gp_ground_seg.core.pipeline.lines import find_lines, trace
+from gp_ground_seg.core.pipeline.points import in_columns
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
 from gp_ground_seg.core.pipeline.relief import Relief
 
 
 class NumbaBackend:
-    """See `gp_ground_seg.core.backend.Backend`."""
+    """The stages of `gp_ground_seg.core.backend.NumpyBackend`, compiled."""
 
     name = 'numba'
+    fit_plane = staticmethod(ground_plane.fit_plane)
+    is_wet = staticmethod(ground_plane.is_wet)
+    extract_lines = staticmethod(partial(find_lines, trace_lines=jit(entry=True)(trace)))
 
     def build_grid(self, xyz: PointArray, config: Config) -> Scan:
         """Sort points into cells and tiles; lowest point of each cell."""
@@ -67,16 +68,6 @@ class NumbaBackend:
         tiles = tiles._replace(extremes=tiles.extremes[:n], place=tiles.place[:n])
         return Scan(xyz, grid, tiles, candidates.first(n_candidates))
 
-    def fit_plane(
-        self, candidates: Candidates, max_slope: float, origin: Direction
-    ) -> GroundPlane | None:
-        """Plane of the ground around the sensor."""
-        return ground_plane.fit_plane(candidates, max_slope, origin)
-
-    def is_wet(self, candidates: Candidates, plane_z: float, sensor_z: float) -> bool:
-        """Whether many candidates are mirror images on a wet road."""
-        return bool(ground_plane.is_wet(candidates, plane_z, sensor_z))
-
     def find_faces(self, scan: Scan, config: Config) -> Faces:
         """Tiles that hold a vertical face."""
         result = Faces.none(scan.tiles)
@@ -95,14 +86,6 @@ class NumbaBackend:
         ):
             return relief, candidates
         return relief, candidates._replace(z=z)
-
-    def extract_lines(
-        self, candidates: Candidates, faces: Faces, config: Config
-    ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray, BoolArray]:
-        """Candidates that show ground, lines, pseudo-inputs; which continue lines, which stand."""
-        buffers = Candidates.buffers(len(candidates.r), len(candidates.offsets) - 1)
-        kept = buffers.first(lines.keep_visible(candidates, faces.has_occluded_base, buffers))
-        return kept, *lines_through(kept, config, lines.trace), faces.is_face[kept.tile]
 
     def learn_frame(self, frame: Frame, config: Config) -> Learned:
         """Hyper-parameters of the frame."""

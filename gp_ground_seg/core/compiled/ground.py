@@ -30,70 +30,37 @@ ROUNDING = 1e-6
 
 
 class SegmentSurfaces(NamedTuple):
-    """The surface of each segment by itself.
+    """The surface of each segment by itself."""
 
-    Attributes
-    ----------
-    log_length_scale : (C,) float64
-        At the candidates [log m].
-    knot_log_length_scale : (M, K) float64
-        At the knots [log m]; NaN from the first knot on that is not wanted.
-    seed : (C,) bool
-        Candidates that start the inlier set.
-    inlier : (C,) bool
-        Candidates that the surface rests on.
-    mean, std : (M, K) float64
-        Height about the prior mean and its standard deviation at the knots [m]; NaN where there
-        is none.
-    """
-
-    log_length_scale: FloatArray
+    log_length_scale: FloatArray  # (C,) at the candidates [log m]
+    # (M, K) at the knots [log m]; NaN from the first knot on that is not wanted
     knot_log_length_scale: FloatArray
-    seed: BoolArray
-    inlier: BoolArray
+    seed: BoolArray  # (C,) candidates that start the inlier set
+    inlier: BoolArray  # (C,) candidates that the surface rests on
+    # (M, K) height about the prior mean and its standard deviation at the knots [m]; NaN where
+    # there is none
     mean: FloatArray
     std: FloatArray
 
 
 class _Columns(NamedTuple):
-    """State of the candidates of a segment, and of the knots behind them; one column each.
+    """State of the n candidates of a segment, and of the knots behind them; one column each."""
 
-    Attributes
-    ----------
-    r, length_scale : (size,) float32
-        Ranges and length-scales [m].
-    height, variance : (size,) float32
-        Prediction about the prior mean [m], and its variance [m^2], if the slope is 0.
-    lever : (size,) float32
-        How much the prediction changes with the slope [m].
-    slope : (2,) float64
-        What the inliers show of the slope: precision, and precision times slope.
-    z, noise : (n,) float64
-        Heights of the candidates about the prior mean [m], and variances of the noise with which
-        they are observed [m^2].
-    neighbour_height, neighbour_precision : (n,) float64
-        Evidence at the candidates.
-    above : (n,) bool
-        Candidates that the evidence contradicts.
-    new : (n,) int64
-        Candidates that join in this round.
-    whitened : (n, size) float32
-        One row for each inlier.
-    """
-
-    r: FloatArray
-    length_scale: FloatArray
+    r: FloatArray  # (size,) float32, ranges [m]
+    length_scale: FloatArray  # (size,) float32 [m]
+    # (size,) float32, prediction about the prior mean [m], and its variance [m^2], if the slope
+    # is 0
     height: FloatArray
     variance: FloatArray
-    lever: FloatArray
-    slope: FloatArray
-    z: FloatArray
-    noise: FloatArray
-    neighbour_height: FloatArray
-    neighbour_precision: FloatArray
-    above: BoolArray
-    new: IntArray
-    whitened: FloatArray
+    lever: FloatArray  # (size,) float32, how much the prediction changes with the slope [m]
+    slope: FloatArray  # (2,) what the inliers show of the slope: precision, and that times slope
+    z: FloatArray  # (n,) heights of the candidates about the prior mean [m]
+    noise: FloatArray  # (n,) variances of the noise with which they are observed [m^2]
+    neighbour_height: FloatArray  # (n,) evidence at the candidates [m]
+    neighbour_precision: FloatArray  # (n,) its precision [1/m^2]
+    above: BoolArray  # (n,) candidates that the evidence contradicts
+    new: IntArray  # (n,) candidates that join in this round
+    whitened: FloatArray  # (n, size) float32, one row for each inlier
 
 
 @jit()

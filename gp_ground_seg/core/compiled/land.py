@@ -29,27 +29,13 @@ from gp_ground_seg.core.pipeline.relief import (
 
 
 class _Walk(NamedTuple):
-    """What the steps taken so far lead to.
+    """What the steps taken so far lead to."""
 
-    Attributes
-    ----------
-    parent : (C,) int64
-        A tree for each group of candidates that steps join.
-    is_raised : (C,) bool
-        Candidates that are raised.
-    part : (C,) int64
-        As `parent`, by steps between raised candidates alone.
-    is_entry : (C,) bool
-        Raised candidates that a step from one that is not leads to.
-    is_fallen : (C,) bool
-        Candidates that a fall leads to.
-    """
-
-    parent: IntArray
-    is_raised: BoolArray
-    part: IntArray
-    is_entry: BoolArray
-    is_fallen: BoolArray
+    parent: IntArray  # (C,) a tree for each group of candidates that steps join
+    is_raised: BoolArray  # (C,) candidates that are raised
+    part: IntArray  # (C,) as `parent`, by steps between raised candidates alone
+    is_entry: BoolArray  # (C,) raised candidates that a step from one that is not leads to
+    is_fallen: BoolArray  # (C,) candidates that a fall leads to
 
 
 @jit()

@@ -19,7 +19,6 @@ from gp_ground_seg.core.gp.learning import (
     missed_by_line,
     set_likelihood,
 )
-from gp_ground_seg.core.gp.search import search_from
 from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, LearningConfig, ObservationConfig
 
@@ -61,7 +60,6 @@ def learn_frame(
     for i in range(2, len(theta)):
         has_latent |= space.free[i]
     outcome[0], outcome[1] = -math.inf, BUDGET
-    search = search_from(theta, space.lower.copy(), space.upper.copy())
     n_rounds = n_before = n_evaluations = 0
     budget = max(learning.max_evaluations // 2, 1)
     while budget > 0:
@@ -76,9 +74,7 @@ def learn_frame(
             break
         n_before = len(inliers.r)
         slope_std = observation.slope_std
-        n_evaluations += maximise(
-            space, inliers, slope_std, is_map, budget, search, theta, outcome
-        )
+        n_evaluations += maximise(space, inliers, slope_std, is_map, budget, theta, outcome)
         budget = learning.max_evaluations - n_evaluations
     return n_evaluations
 

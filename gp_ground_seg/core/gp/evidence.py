@@ -27,25 +27,15 @@ LEAST_STD = 1e-3
 """Standard deviation of a surface below which it counts as that [m]."""
 LEAST_PRECISION = 1e-3
 """Precision below which a surface shows nothing [1/m^2]: rounding is left of the prior."""
-
-
 ODDS = 0.25
 """Lower bound of the odds that a candidate is an obstacle."""
 
 
 class Evidence(NamedTuple):
-    """Height of the ground at places of segments, by the segments beside them.
+    """Height of the ground at places of segments, by the segments beside them."""
 
-    Attributes
-    ----------
-    height : float64 array
-        Height about the prior mean [m]; 0 where there is no evidence.
-    precision : float64 array
-        Inverse variance [1/m^2]; 0 where there is no evidence.
-    """
-
-    height: FloatArray
-    precision: FloatArray
+    height: FloatArray  # about the prior mean [m]; 0 where there is no evidence
+    precision: FloatArray  # inverse variance [1/m^2]; 0 where there is no evidence
 
 
 @shared

@@ -97,22 +97,17 @@ def estimate_surface(
         odds = 0.0
     model = _Model(frame, sill, gate_noise, z, noise, np.exp(u), np.exp(knot_u), seed, odds)
     everywhere = np.arange(candidates.n_segments)
-    uses_neighbours, none = uses_neighbours_in(frame, config), np.zeros((2, len(z)))
+    uses_neighbours = uses_neighbours_in(frame, config)
+    from_neighbours = Evidence(*np.zeros((2, len(z))))
     prior = prior_variance(sill, slope_std, knots)
 
     def evidence() -> Evidence:
         return evidence_of_neighbours(by_itself.mean, by_itself.std, prior, knots, slope_std)
 
     if uses_neighbours:
-        _grow_segments(everywhere[::STEP], model, Evidence(*none), config, by_itself)
+        _grow_segments(everywhere[::STEP], model, from_neighbours, config, by_itself)
         from_neighbours = at_candidates(evidence(), candidates, knots)
-    _grow_segments(
-        everywhere,
-        model,
-        from_neighbours if uses_neighbours else Evidence(*none),
-        config,
-        by_itself,
-    )
+    _grow_segments(everywhere, model, from_neighbours, config, by_itself)
     mean, std = by_itself.mean, by_itself.std
     if uses_neighbours:
         mean, std = combined_surface(mean, std, prior, *evidence())

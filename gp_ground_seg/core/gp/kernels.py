@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -124,15 +124,13 @@ def _controller() -> Any:
     return ThreadpoolController()
 
 
-@contextlib.contextmanager
+@contextmanager
 def single_threaded_blas() -> Iterator[None]:
     """Keep OpenBLAS from waking its threads within the block.
 
     NumPy wakes them for systems of a dozen unknowns. They find nothing
     to do, yet spin for milliseconds on the cores that the segments need.
     """
-    if ThreadpoolController is None:
-        yield
-        return
-    with _controller().limit(limits=1, user_api='blas'):
+    has_limits = ThreadpoolController is not None
+    with _controller().limit(limits=1, user_api='blas') if has_limits else nullcontext():
         yield

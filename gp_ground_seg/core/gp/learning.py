@@ -23,7 +23,7 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.gp.ground import estimate_surface
 from gp_ground_seg.core.gp.likelihood import log_likelihood
-from gp_ground_seg.core.gp.search import Search, begin, propose, search_from, take_outcome
+from gp_ground_seg.core.gp.search import propose, search_from, take_outcome
 from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.lines import N_CLASSES, class_middles
@@ -172,7 +172,6 @@ def learn_frame(frame: Frame, config: Config) -> Learned:
     has_latent = bool(space.free[2:].any())
     is_map, slope_std = learning.objective == 'map', config.observation.slope_std
     theta, outcome = first_theta(frame, config), np.array([-math.inf, BUDGET])
-    search = search_from(theta, space.lower.copy(), space.upper.copy())
     n_rounds = n_before = n_evaluations = 0
     budget = max(learning.max_evaluations // 2, 1)
     while budget > 0:
@@ -182,9 +181,7 @@ def learn_frame(frame: Frame, config: Config) -> Learned:
         if n_rounds > 2 and len(inliers.r) <= n_before:
             break
         n_before = len(inliers.r)
-        n_evaluations += maximise(
-            space, inliers, slope_std, is_map, budget, search, theta, outcome
-        )
+        n_evaluations += maximise(space, inliers, slope_std, is_map, budget, theta, outcome)
         budget = learning.max_evaluations - n_evaluations
     return Learned.of(theta, float(outcome[0]), n_evaluations, int(outcome[1]), space)
 
@@ -250,7 +247,6 @@ def maximise(
     slope_std: float,
     is_map: bool,
     max_evaluations: int,
-    search: Search,
     theta: FloatArray,
     outcome: FloatArray,
 ) -> int:
@@ -259,16 +255,17 @@ def maximise(
     The best theta so far replaces `theta` after `max_evaluations`. Sets `outcome` (2,) to the
     objective and the place of the status in `STATUSES`, and returns the number of evaluations.
     """
-    n_data, slope, any_free = len(inliers.r), np.empty(len(theta)), False
+    n_data, any_free = len(inliers.r), False
+    slope, lower, upper = np.empty(len(theta)), np.empty(len(theta)), np.empty(len(theta))
     for i in range(len(theta)):
         theta[i] = min(max(theta[i], space.lower[i]), space.upper[i])
         any_free |= space.free[i]
-        search.lower[i] = space.lower[i] if space.free[i] else theta[i]
-        search.upper[i] = space.upper[i] if space.free[i] else theta[i]
+        lower[i] = space.lower[i] if space.free[i] else theta[i]
+        upper[i] = space.upper[i] if space.free[i] else theta[i]
     outcome[0], outcome[1] = -math.inf, CONVERGED
     if n_data == 0 or not any_free:
         return 0
-    begin(search, theta)
+    search = search_from(theta, lower, upper)
     n_evaluations, status = 0, BUDGET
     while n_evaluations < max_evaluations:
         for i in range(len(theta)):

@@ -44,21 +44,9 @@ class Search(NamedTuple):
 @shared
 def search_from(x: FloatArray, lower: FloatArray, upper: FloatArray) -> Search:
     """Begin at `x`, within the bounds: the first trial."""
-    d, room = len(x), np.empty((4, len(x)))
-    places = room[0], room[1], room[2], room[3]
-    search = Search(lower, upper, *places, np.empty((d, d)), np.empty(2))
-    begin(search, x)
-    return search
-
-
-@shared
-def begin(search: Search, x: FloatArray) -> None:
-    """Begin at `x`, within the bounds: the first trial."""
-    for i in range(len(x)):
-        search.x[i], search.gradient[i], search.trial[i] = x[i], 0.0, x[i]
-        for j in range(len(x)):
-            search.inverse[i, j] = 1.0 if i == j else 0.0
-    search.value[0], search.value[1] = -math.inf, 1.0
+    d, best, trial = len(x), x.copy(), x.copy()
+    value = np.array([-math.inf, 1.0])
+    return Search(lower, upper, best, np.zeros(d), trial, np.empty(d), np.eye(d), value)
 
 
 @shared

@@ -381,15 +381,12 @@ class Preset:
         """The defaults with the overrides."""
         return Config().replace(**{name: value for name, (value, _) in self.overrides.items()})
 
-    @property
-    def title(self) -> str:
-        """First line of its file."""
-        return f'Preset {self.name}: {self.purpose}'
-
-    @property
-    def reasons(self) -> dict[str, str]:
-        """Reason of each override by the name of its parameter."""
-        return {name: reason for name, (_, reason) in self.overrides.items()}
+    def to_yaml(self, config: Config) -> str:
+        """Write a parameter file of `config`, with the reasons of values that are the preset's."""
+        title = f'Preset {self.name}: {self.purpose}' if config == self.config else ''
+        given = self.overrides.items()
+        reasons = {name: reason for name, (value, reason) in given if config[name] == value}
+        return config.to_yaml(title, reasons)
 
 
 _PRESETS = (

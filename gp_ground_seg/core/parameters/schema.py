@@ -34,7 +34,6 @@ ROS_PARAMETERS_KEY = 'ros__parameters'
 MAX_FILE_BYTES = 1 << 18  # twenty times the largest of config/
 MAX_VALUES = 500  # of a file: five times those there are
 MAX_DIGITS = 100  # of an integer; Python cannot print one of more than 4,300
-MAX_DEPTH = 20  # of values in each other: a parameter has five
 YAML_SUFFIXES = ('.yaml', '.yml')
 NO_VALUES = 'no parameters of the segmentation in it'
 _WIDTH, _INDENT = 99, '  '  # of the lines of a file that is written
@@ -72,26 +71,12 @@ class ParameterSpec:
         unit = f' {self.unit}' if self.unit else ''
         if self.type is tuple:
             return (
-                f'{NO_BOX} or six numbers in [{self.minimum:g}, {self.maximum:g}]{unit}, of which '
-                'the first, third and fifth are below those that follow them'
+                f'{NO_BOX} or six numbers in [{self.minimum:g}, {self.maximum:g}]{unit}, '
+                'in ascending pairs'
             )
         kind = 'an integer' if self.type is int else 'a number'
         auto = f'{AUTO} or ' if self.auto else ''
         return f'{auto}{kind} in [{self.minimum:g}, {self.maximum:g}]{unit}'
-
-    @property
-    def accepted_briefly(self) -> str:
-        """Accepted values as in a table, without their unit."""
-        if self.choices:
-            return ' or '.join(self.choices)
-        if self.type is bool:
-            return 'true or false'
-        if self.type is str:
-            return 'a name'
-        between = f'{self.minimum:.10g} to {self.maximum:.10g}'
-        if self.type is tuple:
-            return f'{NO_BOX} or six numbers, {between}'
-        return f'{AUTO} or {between}' if self.auto else between
 
     def check(self, value: object) -> ParameterValue:
         """Return `value` in the declared type; ConfigError if it is of another or out of range."""
@@ -295,10 +280,9 @@ class ParameterGroups:
             lines += [*([''] if k else []), *_comment(about, 2), f'{2 * _INDENT}{group_name}:']
             for field_name, value in values.items():
                 spec = self.find_spec(f'{group_name}.{field_name}')
-                facts = spec.accepted_briefly + (f' {spec.unit}' if spec.unit else '')
-                facts += f'; {spec.symbol} in the paper' if spec.symbol else ''
+                facts = spec.accepted + (f'; {spec.symbol} in the paper' if spec.symbol else '')
                 # The facts stay on one line.
-                lines += _comment(f'{spec.description} ' + f'[{facts}]'.replace(' ', _NBSP), 3)
+                lines += _comment(f'{spec.description} ' + f'({facts})'.replace(' ', _NBSP), 3)
                 if spec.name in reasons:
                     default = f'(default {yaml_scalar(spec.default)})'.replace(' ', _NBSP)
                     lines += _comment(f'Here: {reasons[spec.name]} {default}', 3)
@@ -339,28 +323,25 @@ def _nest(flat: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 class _Loader(yaml.SafeLoader):
     """PyYAML's safe loader, without some of its surprises (see `load_yaml`)."""
 
-    depth = 0
-
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Refuse aliases, as ROS does: a kilobyte of them can stand for gigabytes; and depths."""
+        """Refuse aliases, as ROS does: a kilobyte of them can stand for gigabytes."""
         event = self.peek_event()  # type: ignore[no-untyped-call]
         line = event.start_mark.line + 1
         if isinstance(event, yaml.AliasEvent):
             raise ConfigError(f'line {line}: aliases (*name) are not accepted')
-        if self.depth == MAX_DEPTH:
-            raise ConfigError(f'line {line}: more than {MAX_DEPTH} levels')
-        self.depth += 1
-        node = super().compose_node(parent, index)
-        self.depth -= 1
-        return node
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Refuse a key that is there twice; the last would win silently."""
-        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-        for key, n_times in keys.items():
-            if n_times > 1:
-                raise ConfigError(f'{key}: given twice, from line {node.start_mark.line + 1} on')
+        keys = (key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        _refuse_repeated(keys, f', from line {node.start_mark.line + 1} on')
         return super().construct_mapping(node, deep)
+
+
+def _refuse_repeated(names: Iterable[str], where: str = '') -> None:
+    for name, n_times in Counter(names).items():
+        if n_times > 1:
+            raise ConfigError(f'{name}: given twice{where}')
 
 
 def _construct_int(loader: _Loader, node: yaml.ScalarNode) -> int:
@@ -384,12 +365,18 @@ _Loader.add_implicit_resolver(
 
 
 def read_yaml(path: str | Path) -> object:
-    """Read a YAML file as `load_yaml`; ConfigError also if it is too large to be of parameters."""
-    with open(path, 'rb') as file:
-        data = file.read(MAX_FILE_BYTES + 1)
+    """Read a YAML file as `load_yaml`; ConfigError also if it cannot be read or is too large."""
+    try:
+        with open(path, 'rb') as file:
+            data = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(reason_of(error)) from error
     if len(data) > MAX_FILE_BYTES:
         raise ConfigError(f'too large for a parameter file, accepted are {MAX_FILE_BYTES} bytes')
-    return load_yaml(data.decode('utf-8'))
+    try:
+        return load_yaml(data.decode('utf-8'))
+    except UnicodeDecodeError as error:
+        raise ConfigError('not a text file') from error
 
 
 def load_yaml(text: str) -> object:
@@ -420,46 +407,35 @@ class ParameterFile(NamedTuple):
 
 def read_parameters(path: str | Path) -> ParameterFile:
     """Read a parameter file; ConfigError if it cannot be read or parsed, or gives a name twice."""
-    try:
-        document = read_yaml(path)
-        values: dict[str, object] = {}
-        for name, value in _flatten(_unwrap_ros(document)):
-            if name in values:
-                raise ConfigError(f'{name}: given twice')
-            if len(values) == MAX_VALUES:
-                raise ConfigError(f'more than {MAX_VALUES} values, too many for a parameter file')
-            values[name] = value
-        node = ''
-        if isinstance(document, Mapping) and _is_ros(document):
-            (node,) = map(str, document)
-        return ParameterFile(values, node)
-    except OSError as error:
-        raise ConfigError(reason_of(error)) from error
-    except UnicodeDecodeError as error:
-        raise ConfigError('not a text file') from error
+    groups, node = _unwrap_ros(read_yaml(path))
+    given = list(_flatten(groups))
+    if len(given) > MAX_VALUES:
+        raise ConfigError(f'more than {MAX_VALUES} values, too many for a parameter file')
+    _refuse_repeated(name for name, _ in given)
+    return ParameterFile(dict(given), node)
 
 
-def _unwrap_ros(document: object) -> Mapping[str, object]:
-    """Parameters of a ROS parameter file, or of a file of bare groups."""
+def _unwrap_ros(document: object) -> tuple[Mapping[str, object], str]:
+    """Return groups of parameters, and the node that a file names; '' if it names none."""
     if document is None:
-        return {}
+        return {}, ''
     if not isinstance(document, Mapping):
         raise ConfigError('must be a mapping of parameter groups')
     if not _is_ros(document):
-        return document
+        return document, ''
     if len(document) != 1:
         raise ConfigError(f'parameters of {len(document)} nodes; keep one, keyed {ROS_NODE_KEY}')
-    (node,) = document.values()
-    if not isinstance(node, Mapping) or not isinstance(node.get(ROS_PARAMETERS_KEY), Mapping):
+    ((node, below),) = document.items()
+    if not isinstance(below, Mapping) or not isinstance(below.get(ROS_PARAMETERS_KEY), Mapping):
         raise ConfigError(f'no mapping {ROS_PARAMETERS_KEY} below the node name')
-    if len(node) > 1:
+    if len(below) > 1:
         raise ConfigError(f'values beside {ROS_PARAMETERS_KEY}, which ROS refuses')
     # Names that every ROS node has are no parameters of the segmentation.
     return {
         key: value
-        for key, value in node[ROS_PARAMETERS_KEY].items()
+        for key, value in below[ROS_PARAMETERS_KEY].items()
         if key not in OF_EVERY_NODE and not str(key).startswith('qos_overrides')
-    }
+    }, str(node)
 
 
 def _is_ros(document: Mapping[str, object]) -> bool:

@@ -163,9 +163,8 @@ class GroundPlane(NamedTuple):
     support: float = 0.0  # share of the cells that lie on it
     near_support: float = 0.0  # the same of their weights, see `weight_at`
     coverage: float = 0.0  # share of all sectors around the sensor with such a cell
-    far_coverage: float = (
-        0.0  # share of the sectors with any cell that have such a cell `FAR` away
-    )
+    # share of the sectors with any cell that have such a cell `FAR` away
+    far_coverage: float = 0.0
     reach: float = 0.0  # range within which nine of ten of these cells are [m]
     # angle at which the sensor sees nine of ten of these below the plane through it that is
     # parallel to this one, at most [rad]: on a slope not that below the horizon
@@ -176,9 +175,7 @@ class GroundPlane(NamedTuple):
     spread: float = 0.0
     # share of the sectors with any cell where rays to it cross a nearer level that goes on behind
     seen_through: float = 0.0
-    residual: float = 0.0  # root mean square of the distances along z of these cells to it [m]
-    n_cells: int = 0  # how many cells there were
-    n_support: int = 0  # how many of them lie on it
+    n_support: int = 0  # how many cells lie on it
 
     @property
     def depth(self) -> float:
@@ -194,11 +191,6 @@ class GroundPlane(NamedTuple):
         """Upward unit normal."""
         length = math.sqrt(self.slope_x**2 + self.slope_y**2 + 1.0)
         return -self.slope_x / length, -self.slope_y / length, 1.0 / length
-
-    @property
-    def up(self) -> FloatArray:
-        """The same as an array, (3,)."""
-        return np.array(self.normal)
 
 
 NO_PLANE = GroundPlane()
@@ -442,7 +434,7 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> G
     """Measure how well a plane is seen."""
     height, slope_x, slope_y = plane
     ranges, drops, near, angles = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    n_on_it, n_near, squares, weight, whole = 0, 0, 0.0, 0.0, 0.0
+    n_on_it, n_near, weight, whole = 0, 0, 0.0, 0.0
     n_seen = n_covered = n_far = 0
     last_seen = last_covered = last_far = -1
     for c in range(n):
@@ -462,7 +454,7 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> G
         ranges[n_on_it], drops[n_on_it] = r, math.atan2(origin[2] - z, away)
         angles[n_on_it] = math.atan2(distance(origin[0], origin[1], origin[2], plane) - d, away)
         n_on_it += 1
-        squares, weight = squares + d * d, weight + cells.weight[c]
+        weight += cells.weight[c]
         if r < NEAR:
             near[n_near] = d
             n_near += 1
@@ -487,8 +479,6 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> G
         depression=ranked(angles[:n_on_it], most),
         spread=ranked(drops[:n_on_it], most) - ranked(drops[:n_on_it], few),
         seen_through=count_seen_through(cells, n, plane, origin) / n_seen,
-        residual=math.sqrt(squares / n_on_it),
-        n_cells=n,
         n_support=n_on_it,
     )
 

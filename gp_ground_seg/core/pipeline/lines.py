@@ -39,21 +39,18 @@ Groups = tuple[LinesConfig, GrowthConfig, LatentConfig, LengthScaleConfig]
 
 
 def find_lines(
-    candidates: Candidates, faces: Faces, config: Config
+    candidates: Candidates,
+    faces: Faces,
+    config: Config,
+    trace_lines: Callable[..., tuple[int, int]] | None = None,
 ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray, BoolArray]:
     """Lines through the candidates that show ground, and what follows from the lines.
 
-    The lowest point of a face with occluded base is no candidate. Returns the candidates kept
-    and, last, which of them are in faces; see `lines_through` for the others.
+    The lowest point of a face with occluded base is no candidate. Returns the candidates kept,
+    lines, pseudo-inputs, and which candidates continue a line and which are in faces.
+    `trace_lines` is `trace`, compiled or not.
     """
-    kept = candidates.where(~faces.has_occluded_base[candidates.tile])
-    return kept, *lines_through(kept, config, _trace_lists), faces.is_face[kept.tile]
-
-
-def lines_through(
-    candidates: Candidates, config: Config, trace_lines: Callable[..., tuple[int, int]]
-) -> tuple[Lines, PseudoInputs, BoolArray]:
-    """Lines, pseudo-inputs, and which candidates continue a line, by `trace`, compiled or not."""
+    candidates = candidates.where(~faces.has_occluded_base[candidates.tile])
     n = len(candidates.r)
     lines = Lines(np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64))
     offsets = np.empty(len(candidates.offsets), np.int64)
@@ -64,13 +61,15 @@ def lines_through(
         map(numbers_of, (config.lines, config.growth, config.latent, config.length_scale))
     )
     is_break = find_breaks(candidates.r, candidates.density, config.lines)
-    n_lines, n_pseudo = trace_lines(candidates, is_break, groups, lines, pseudo, continues_line)
+    n_lines, n_pseudo = (trace_lines or _trace_lists)(
+        candidates, is_break, groups, lines, pseudo, continues_line
+    )
     lines = Lines(lines.line, lines.slope[:n_lines], lines.start[: n_lines + 1])
     n = n_pseudo
     pseudo = PseudoInputs(pseudo.r_bar[:n], pseudo.log_extent[:n], offsets, line[:n], kind[:n])
     if config.learning.length_scale == 'classes':
         pseudo = shared_by_class(lines, pseudo, config.length_scale)
-    return lines, pseudo, continues_line
+    return candidates, lines, pseudo, continues_line, faces.is_face[candidates.tile]
 
 
 def _trace_lists(

@@ -7,8 +7,6 @@ that would accept trunks, persons and cars as ground.
 
 from __future__ import annotations
 
-import dataclasses
-
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, find_spec
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
@@ -33,23 +31,15 @@ def for_sensor(config: Config, pose: SensorPose, sensor: SensorConfig) -> Config
     share = sensor_height_of(pose, sensor) / REFERENCE_HEIGHT
     if share >= 1.0 or config.label.rule != 'roughness':
         return config
-
-    def shrunk(name: str) -> float:
-        """Return a parameter in proportion, as far as it may be so small."""
-        return max(share * float(config[name]), float(find_spec(name).minimum or 0.0))
-
-    least_tolerance = min(LEAST_TOLERANCE, config.label.ground_tolerance)
-    growth = dataclasses.replace(
-        config.growth,
-        seed_height_tolerance=shrunk('growth.seed_height_tolerance'),
-        max_std=shrunk('growth.max_std'),
+    names = (
+        'growth.seed_height_tolerance',
+        'growth.max_std',
+        'label.ground_tolerance',
+        'label.obstacle_min_height',
     )
-    label = dataclasses.replace(
-        config.label,
-        ground_tolerance=max(shrunk('label.ground_tolerance'), least_tolerance),
-        obstacle_min_height=shrunk('label.obstacle_min_height'),
-    )
-    return dataclasses.replace(config, growth=growth, label=label)
+    least = {name: float(find_spec(name).minimum or 0.0) for name in names}
+    least['label.ground_tolerance'] = min(LEAST_TOLERANCE, config.label.ground_tolerance)
+    return config.replace(**{name: max(share * config[name], least[name]) for name in names})
 
 
 def sensor_height_of(pose: SensorPose, sensor: SensorConfig) -> float:

@@ -161,11 +161,6 @@ def objection_to_ranges(xyz: PointArray) -> str:
     )
 
 
-def check_points(points: npt.ArrayLike) -> FloatArray:
-    """Return a copy of x, y, z in double precision; parameters and errors of `take_points`."""
-    return np.array(take_points(points), dtype=np.float64, order='F')
-
-
 def in_columns(xyz: PointArray) -> PointArray:
     """Points (N, 3), read-only, with each coordinate contiguous; a copy if they are not."""
     result: PointArray = np.ascontiguousarray(xyz.T).T

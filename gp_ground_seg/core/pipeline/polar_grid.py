@@ -99,24 +99,12 @@ def segment_edges(n_segments: int) -> FloatArray:
 
 
 class BinLookup(NamedTuple):
-    """Edges of bins, and a table that gives the bin of a value without a search.
+    """Edges of bins, and a table that gives the bin of a value without a search."""
 
-    Attributes
-    ----------
-    edges : (n + 1,) float32 or float64
-        Edges rounded up to the precision of the values (see `round_up_to`).
-    bins : (T,) int32
-        Bin of the values from ``edges[0] + k / scale`` on, a little early.
-    ends : (T,) float32 or float64
-        Where that bin ends.
-    scale : float
-        Entries per unit.
-    """
-
-    edges: PointArray
-    bins: CellArray
-    ends: PointArray
-    scale: float
+    edges: PointArray  # (n + 1,) rounded up to the precision of the values, see `round_up_to`
+    bins: CellArray  # (T,) bin of the values from ``edges[0] + k / scale`` on, a little early
+    ends: PointArray  # (T,) where that bin ends
+    scale: float  # entries per unit
 
     @classmethod
     def of(cls, edges: FloatArray, fineness: int, dtype: np.dtype[np.floating]) -> BinLookup:
@@ -146,25 +134,13 @@ class BinLookup(NamedTuple):
 
 
 class GridGeometry(NamedTuple):
-    """Where the edges of cells and tiles lie.
+    """Where the edges of cells and tiles lie."""
 
-    Attributes
-    ----------
-    ranges, azimuths : BinLookup
-        Bins over range [m], segments over azimuth key.
-    edges : (n_bins + 1,) float64
-        Exact ranges of the bin edges [m].
-    tiles_per_metre : float
-        One over the side of a tile [1/m].
-    n_sides : int
-        Tiles along a side of the square, which holds the polar grid.
-    """
-
-    ranges: BinLookup
-    azimuths: BinLookup
-    edges: FloatArray
-    tiles_per_metre: float
-    n_sides: int
+    ranges: BinLookup  # bins over range [m]
+    azimuths: BinLookup  # segments over azimuth key
+    edges: FloatArray  # (n_bins + 1,) exact ranges of the bin edges [m]
+    tiles_per_metre: float  # one over the side of a tile [1/m]
+    n_sides: int  # tiles along a side of the square, which holds the polar grid
 
 
 @lru_cache(maxsize=4)
