@@ -79,10 +79,12 @@ def test_the_environment_is_recorded():
     assert environment['n_cores'] == len(os.sched_getaffinity(0))
     assert environment['python'] == platform.python_version()
     assert environment['cpu']
-    line = report.machine_line({**environment, 'n_cores': 1, 'commit': f'{"a" * 40}-dirty'})
-    assert ', 1 core; Python' in line and 'no-such-package absent' in line
+    line = report.machine_line(
+        {**environment, 'n_cores': 1, 'commit': f'{"a" * 40}-dirty'}, 'numba'
+    )
+    assert ', 1 thread on 1 core, numba; Python' in line and 'no-such-package absent' in line
     assert line.endswith(f'commit {"a" * 12} (changed since)')
-    assert 'commit' not in report.machine_line({**environment, 'commit': None})
+    assert 'commit' not in report.machine_line({**environment, 'commit': None}, 'numpy')
 
 
 def test_commit_is_that_of_the_source_or_none(tmp_path):

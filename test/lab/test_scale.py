@@ -63,33 +63,31 @@ def everything(path):
     document = json.loads(path.read_text())
     for name in ('environment', 'times', 'stages'):
         document.pop(name, None)
-    if 'measures' in document:
-        assert document['measures'].pop()['measure'].startswith('time')
-    for row in document['rows']:
-        row.pop('seconds', None)
-    measures = document.get('measures', [])
-    document['measures'] = [each for each in measures if '[ms]' not in each['measure']]
+    document['rows'] = [
+        {key: x for key, x in row.items() if key != 'seconds' and not key.startswith('stage_')}
+        for row in document['rows']
+    ]
     return document
 
 
-SAME = {
-    'evaluate ROOT': ', 2 workers beside one another  [ms]',
-    'evaluate ROOT --peer patchworkpp': ', 2 workers beside one another  [ms]',
-    'experiment ablation ROOT': 'workers with 2 threads in all',
-    'experiment objects --sensors vlp-16 --scenes urban,car_park --seeds 1': '2 threads in all',
-}
-
-
-@pytest.mark.parametrize('line', SAME)
+@pytest.mark.parametrize(
+    'line',
+    [
+        'evaluate ROOT',
+        'evaluate ROOT --peer patchworkpp',
+        'experiment ablation ROOT',
+        'experiment objects --sensors vlp-16 --scenes urban,car_park --seeds 1',
+    ],
+)
 def test_reports_are_the_same_to_the_last_digit(line, root, scheduler, tmp_path, capsys):
     """Here, in processes and on a cluster."""
     words = [root if word == 'ROOT' else word for word in line.split()]
     assert run(*words, '--json', tmp_path / 'here.json') == 0
-    assert SAME[line] not in capsys.readouterr().out
+    assert 'workers with 2 threads in all' not in capsys.readouterr().out
     for more in ('--workers', '2'), ('--scheduler', scheduler):
         assert run(*words, '--json', tmp_path / 'there.json', '--force', *more) == 0
         assert everything(tmp_path / 'there.json') == everything(tmp_path / 'here.json')
-        assert SAME[line] in capsys.readouterr().out
+        assert 'workers with 2 threads in all' in capsys.readouterr().out
 
 
 def test_labels_are_the_same_with_any_number_of_workers(root, scheduler, tmp_path, capsys):

@@ -173,15 +173,16 @@ def describe_environment(*packages: str) -> dict[str, Any]:
     }
 
 
-def machine_line(environment: Mapping[str, Any], backend: str = '') -> str:
+def machine_line(environment: Mapping[str, Any], backend: str) -> str:
     """One line on where a measurement ran."""
     cores = '1 core' if environment['n_cores'] == 1 else f'{environment["n_cores"]} cores'
-    if backend:
-        n_workers = environment.get('n_workers')
-        threads = f'workers with {n_workers} threads in all' if n_workers else '1 thread'
-        cores = f'{threads} on {cores}, {backend}'
+    n_workers = environment.get('n_workers')
+    threads = f'workers with {n_workers} threads in all' if n_workers else '1 thread'
     versions = ', '.join(f'{name} {v or "absent"}' for name, v in environment['versions'].items())
-    machine = f'machine: {environment["cpu"]}, {cores}; Python {environment["python"]}, {versions}'
+    machine = (
+        f'machine: {environment["cpu"]}, {threads} on {cores}, {backend}; '
+        f'Python {environment["python"]}, {versions}'
+    )
     if not environment['commit']:
         return machine  # installed, not run from a checkout
     commit, _, dirty = environment['commit'].partition('-')
