@@ -46,7 +46,7 @@ def heights_of(relief):
     return relief.at(x.ravel(), y.ravel()).reshape(x.shape)
 
 
-@settings(max_examples=fewer(8, 3), deadline=None)
+@settings(max_examples=fewer(12, 6), deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from([4, 45, 90]), st.booleans())
 def test_relief_is_the_reference(backend, seed, n_segments, looks_aside):
     rng = np.random.default_rng(seed)
