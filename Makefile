@@ -1,4 +1,4 @@
-# make demo | make test | make test-all | make browser-test | make bench | make colcon | make dist | make lint | make docs: each creates the environment it needs.
+# make demo | make test | make test-all | make browser-test | make bench | make node-bench | make colcon | make dist | make lint | make docs: each creates the environment it needs.
 PYTHON ?= python3
 # Not the .venv of README: two ways of installation in one environment get in each other's way.
 VENV ?= .venv-dev
@@ -7,7 +7,7 @@ KITTI ?= $(abspath $(wildcard ../shared/kitti))
 # Empty, the variable would be a path to the tests.
 WITH_KITTI := $(if $(KITTI),GP_GROUND_SEG_KITTI=$(KITTI))
 
-.PHONY: help demo test test-all chromium browser-test torture bench figures docs colcon dist lint format generate clean
+.PHONY: help demo test test-all chromium browser-test torture bench figures docs node-bench colcon dist lint format generate clean
 
 help:
 	@echo 'make demo      a synthetic drive through the node: score, latency and a picture'
@@ -18,6 +18,7 @@ help:
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
 	@echo 'make figures   every table and picture of README and docs anew (needs KITTI=PATH; ONLY=word for some)'
 	@echo 'make docs      the documentation as HTML, in build/docs'
+	@echo 'make node-bench  latency and losses of the node over DDS'
 	@echo 'make colcon    colcon build and colcon test (PYTEST_ARGS=... for some tests)'
 	@echo 'make dist      the wheel, built, installed and used outside the repository'
 	@echo 'make lint      ruff, mypy, import-linter, codespell, and the limits of size'
@@ -77,6 +78,9 @@ figures: $(VENV)/.dev
 docs: $(VENV)/.docs
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going docs build/docs
 	@echo 'build/docs/index.html is the first page'
+
+node-bench: $(VENV)/.ros
+	$(BIN)/python test/node_bench.py $(KITTI)
 
 # The interpreter of colcon is that of the node; ROS wheels lie below its prefix.
 colcon: export AMENT_PREFIX_PATH := $(abspath $(VENV))

@@ -15,6 +15,7 @@ from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
 from gp_ground_seg.lab import table1 as paper_table
 from gp_ground_seg.lab.scoring import evaluate as runner
+from gp_ground_seg.lab.scoring.report import records
 from gp_ground_seg.lab.simulation import (
     DRIVES,
     HDL_32E,
@@ -238,7 +239,7 @@ def test_default_segments_of_real_frames(kitti, monkeypatch):
         for name in ('held out Z-L', 'held out Z', 'in sample Z-L', 'in sample Z'):
             assert 0.0 < row[name] < 0.5
     # Below ours the preset, which learns until it converges, and what the paper printed.
-    variances, errors = (report.tables[name].json() for name in ('variances', 'errors'))
+    variances, errors = (records(report.tables[name].frame) for name in ('variances', 'errors'))
     assert [row['by'] for row in errors] == ['ours'] * 4 + ['preset'] * 4 + ['paper'] * 4
     result = GroundSegmenter('paper').segment(read_points(kitti / FIRST))
     assert variances[4]['sigma_f^2'] == pytest.approx(result.fit.theta['sigma_f'] ** 2)

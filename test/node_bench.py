@@ -1,0 +1,172 @@
+"""Latency and losses of the node: ``python test/node_bench.py [DATA]``, on an idle machine.
+
+The node runs in a second process and is sent clouds through ROS at several rates, in a namespace
+of a random name. DATA is a folder with sequences/*/velodyne below it, a scan, a
+folder of scans, or a bag; without it, simulated scans of an HDL-64E. What follows ``--ros-args``
+goes to the node.
+"""
+
+import argparse
+import itertools
+import sys
+import tempfile
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from gp_ground_seg.cli.bags import scan_cloud
+from gp_ground_seg.cli.demo import FRAME_ID, simulated_drive
+from gp_ground_seg.cli.options import progress
+from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_stamp
+from gp_ground_seg.data.inputs import list_inputs
+from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
+from gp_ground_seg.lab.scoring.report import describe_environment, machine_line
+from gp_ground_seg.ros.node_process import INPUT, OUTPUTS, Link, NodeProcess, private_session
+
+SILENCE = 2.0
+"""Time without a cloud after which what is still missing is lost [s]."""
+N_SIMULATED = 10
+PERCENTILES = {50: 'p50 [ms]', 95: 'p95', 99: 'p99', 100: 'worst'}
+
+
+def dropped_by_node(session, arrays):
+    """Clouds that the node has dropped, by its next report."""
+    arrays.clear()
+    end = time.monotonic() + 5.0
+    while not arrays and time.monotonic() < end:
+        session.spin(0.05)
+    for status in (status for array in arrays for status in array.status):
+        if status.name.endswith(': processing'):
+            return int({e.key: e.value for e in status.values}['Dropped since startup'])
+    raise TimeoutError('no diagnostics of the node within 5 s')
+
+
+class Probe:
+    """Sends clouds at a rate, whether or not results come back, and notes when both did."""
+
+    def __init__(self, session):
+        from sensor_msgs.msg import PointCloud2
+
+        self._session, self._sent, self._back = session, {}, {}
+        self._publisher = session.publisher_of_clouds(INPUT, 10)
+        for topic in OUTPUTS:
+            take = partial(self._take, topic)
+            session.node.create_subscription(PointCloud2, topic, take, 50, raw=True)
+
+    def _take(self, topic, raw, info):
+        back = self._back.setdefault(stamp_of(decode_cloud(raw)), {})
+        back[topic] = info.get('received_timestamp') or time.time_ns()
+
+    def _n_back(self):
+        return sum(len(self._back.get(stamp, ())) == len(OUTPUTS) for stamp in self._sent)
+
+    def send(self, clouds, rate, on_sent):
+        """Send clouds at a rate [Hz]; return counts, and percentiles of the latency."""
+        self._sent.clear()
+        due = time.monotonic()
+        for cloud in clouds:
+            raw = encode_cloud(cloud)
+            while (left := due - time.monotonic()) > 0.0:
+                self._session.spin(left)
+            self._sent[stamp_of(cloud)] = time.time_ns()
+            self._publisher.publish(raw)
+            on_sent()
+            due += 1.0 / rate
+        n_back, last_news = self._n_back(), time.monotonic()
+        while n_back < len(self._sent) and time.monotonic() < last_news + SILENCE:
+            self._session.spin(0.02)
+            if (n := self._n_back()) > n_back:
+                n_back, last_news = n, time.monotonic()
+        return self._result(rate)
+
+    def _result(self, asked):
+        latency = [
+            1e-6 * (max(back.values()) - sent)
+            for stamp, sent in self._sent.items()
+            if len(back := self._back.get(stamp, {})) == len(OUTPUTS)
+        ]
+        first, *_, last = self._sent.values()
+        n_sent, n_back = len(self._sent), len(latency)
+        row = {
+            'rate [Hz]': f'{asked:g}',
+            'sent [Hz]': f'{1e9 * (n_sent - 1) / (last - first):.2f}',
+        }
+        row |= {'sent': n_sent, 'back': n_back, 'lost': n_sent - n_back}
+        percents = np.percentile(latency, [*PERCENTILES]) if latency else [np.nan] * 4
+        return row | {
+            name: f'{p:.1f}' for name, p in zip(PERCENTILES.values(), percents, strict=True)
+        }
+
+
+def restamped(clouds, start):
+    """Yield clouds over and over, stamped every 0.1 s from the second `start` on."""
+    for k, cloud in enumerate(itertools.cycle(clouds)):
+        yield with_stamp(cloud, (start + k // 10, k % 10 * 10**8))
+
+
+def measure(clouds, rates, n_frames, ros_args=()):
+    """Results at each rate, with what the node says it dropped."""
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    stamped = restamped(clouds, 1_700_000_000)
+    with (
+        private_session('node_bench') as (session, own),
+        tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
+        NodeProcess(Path(folder, 'log'), [*own, *ros_args]) as node,
+    ):
+        arrays, results = [], []
+        session.node.create_subscription(DiagnosticArray, '/diagnostics', arrays.append, 10)
+        Link(session, node).connect(clouds[0])
+        while not node.is_compiled() and 'runtime.backend:=numpy' not in ros_args:
+            session.sleep(0.2)
+            node.check()
+        probe = Probe(session)
+        for rate in rates:
+            before = dropped_by_node(session, arrays)
+            with progress(f'{rate:g} Hz')(total=n_frames) as bar:
+                found = probe.send(itertools.islice(stamped, n_frames), rate, bar.update)
+            n_dropped = dropped_by_node(session, arrays) - before
+            results.append({**found, 'reported': n_dropped})
+        node.check()
+    return results
+
+
+def read_scans(path, n_wanted, topic):
+    """Points of the first scans of a KITTI folder, or of what `segment` takes."""
+    if topic is None and any(path.glob('sequences/*/velodyne')):
+        frames = labelled_frames(path)[:n_wanted]
+        return [read_points(frame.points_path, frame.columns) for frame in frames]
+    inputs = list_inputs(path, 4, topic)
+    clouds = [item.read().xyz for item in itertools.islice(inputs, n_wanted)]
+    return [np.column_stack([xyz, np.ones(len(xyz))]).astype(np.float32) for xyz in clouds]
+
+
+def main():
+    """Measure, and print a table."""
+    words, mark, ros_args = sys.argv[1:], '--ros-args', []
+    if mark in words:
+        words, ros_args = words[: words.index(mark)], words[words.index(mark) + 1 :]
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('data', nargs='?')
+    parser.add_argument('--topic', help='PointCloud2 topic of a bag')
+    parser.add_argument('--clouds', type=int, default=30, help='different clouds')
+    parser.add_argument('--rates', type=float, nargs='+', default=[10.0, 20.0, 50.0])
+    parser.add_argument('--frames', type=int, default=600, help='clouds sent at each rate')
+    given = parser.parse_args(words)
+    if given.data:
+        scans = read_scans(Path(given.data), given.clouds, given.topic)
+    else:
+        scans = [points for points, _, _ in simulated_drive(N_SIMULATED)]
+    clouds = [scan_cloud(points, 0, FRAME_ID) for points in scans]
+    rates = measure(clouds, given.rates, given.frames, ros_args)
+    n_points = sum(map(len, scans)) / len(scans)
+    print(f'{given.data or "simulated HDL-64E"}: {len(scans)} clouds of {n_points:.0f} points')
+    for row in ([*rates[0]], *(rate.values() for rate in rates)):
+        print(' '.join(f'{cell:>10}' for cell in row))
+    print(machine_line(describe_environment(), 'numba'))
+
+
+if __name__ == '__main__':
+    main()
