@@ -1,8 +1,9 @@
 """The one policy for code compiled with numba, which is optional, and for keeping it on disk.
 
-Each compiled function has a file with a checksum, in a folder of the user that is named by our
-sources and by versions: code of other sources is never read, and a file that is damaged is
-compiled again. Of several processes one compiles, and the others wait for its files.
+numba keeps compiled code itself (``cache=True``), here in a folder of the user that is named by
+our sources and by versions: code of other sources is never read. Each function has a checksum of
+its files: what is damaged, as after a power cut, is compiled again. Of several processes one
+compiles, and the others wait for its files.
 """
 
 from __future__ import annotations
@@ -10,11 +11,11 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import functools
+import glob
 import hashlib
 import importlib.util
 import logging
 import os
-import pickle
 import stat
 import sys
 import time
@@ -38,8 +39,8 @@ _CORE = Path(__file__).parent
 _entry_points: list[Any] = []
 _shared: list[Callable[..., Any]] = []
 _ALL, _LOCK = 'all', 'lock'
-_CHECKSUM_SIZE = hashlib.sha256().digest_size
-_kept: dict[str, str] = {}  # by function, a file of it that this process has read or written
+_CHECKSUM = '.sha256'
+_kept: set[str] = set()  # checksums of the functions that this process has read or written
 _turn: IO[bytes] | None = None  # the file that is locked while a process compiles
 _patience = 120.0  # longest wait for others, in all [s]: one may be suspended
 
@@ -132,89 +133,96 @@ def jit(
             # Without a wrapper for Python, which takes a tenth of the time to compile: there the
             # function stays plain.
             return compiled_form(function, fastmath=fastmath)(function)
-        compiled = numba.njit(**_options())(function)
-        if folder := code_folder():
-            compiled._cache = _CodeFiles(folder, f'{function.__module__}.{function.__qualname__}')
+        compiled: _Function = _njit_kept(function)
         _entry_points.append(compiled)
-        entry_point: _Function = compiled
-        return entry_point
+        return compiled
 
     return decorate
 
 
-class _CodeFiles:
-    """Files of one function, in place of numba's own cache, which has no checksums.
+def _njit_kept(function: Callable[..., Any]) -> Any:
+    """Compile `function` with its code kept on disk, if there is a folder to trust for it."""
+    import numba
 
-    A numba dispatcher asks for each type of arguments, and hands over what it compiles.
-    """
+    folder = code_folder()
+    if folder is None:
+        return numba.njit(**_options())(function)
+    # numba reads this once, here. Without it, code would lie beside our sources.
+    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
+    try:
+        kept = numba.njit(**_options(), cache=True)(function)
+    finally:
+        numba.config.CACHE_DIR = before
+    place = Path(kept.stats.cache_path)
+    if folder not in place.parents:
+        _log_not_kept(f'{folder} cannot be written to')
+        return numba.njit(**_options())(function)
+    # numba has no public hook here; a numba without these names keeps code without checksums.
+    cache: Any = getattr(kept, '_cache', None)
+    module = Path(function.__code__.co_filename).stem
+    if hasattr(cache, 'load_overload') and hasattr(cache, 'save_overload'):
+        checksum = place / f'{module}.{function.__qualname__}{_CHECKSUM}'
+        cache.load_overload = functools.partial(_load, cache.load_overload, folder, checksum)
+        cache.save_overload = functools.partial(_save, cache.save_overload, folder, checksum)
+    return kept
 
-    def __init__(self, folder: Path, name: str) -> None:
-        self.cache_path, self._name = folder, name
 
-    def load_overload(self, signature: Any, target: Any) -> Any:
-        """Return what `save_overload` was given; None if numba has to compile it."""
-        from numba.core.compiler import CompileResult
-
-        target.refresh()
-        path = self._path(signature, target.codegen())
-        if (code := _read_whole(path)) is None:
-            _begin_turn(self.cache_path)
-            if (code := _read_whole(path)) is None:
-                log_once(logging.INFO, 'compiling for this processor, which takes 20 to 60 s')
-                return None
+def _load(load: Callable[..., Any], folder: Path, checksum: Path, *arguments: Any) -> Any:
+    """Let numba `load` code if its files are whole; None where it has to compile."""
+    with contextlib.suppress(OSError):
+        if not _is_whole(checksum):
+            _begin_turn(folder)
+            if not _is_whole(checksum):
+                for path in _files_of(checksum):
+                    path.unlink(missing_ok=True)
+        if (found := load(*arguments)) is not None:
+            _list(folder, checksum)
             _end_turn()  # another process has compiled it meanwhile
-        self._list(path)
-        return CompileResult._rebuild(target, *pickle.loads(code))
-
-    def save_overload(self, signature: Any, result: Any) -> None:
-        """Write what was compiled; a full disk is a warning."""
-        from numba.core.serialize import dumps
-
-        path = self._path(signature, result.codegen)
-        try:
-            if not result.library.has_dynamic_globals:  # addresses in this process
-                _write_whole(path, dumps(result._reduce()))
-                self._list(path)
-        except OSError as error:
-            _log_not_kept(error)
-        finally:
-            _end_turn()
-
-    def _path(self, signature: Any, codegen: Any) -> Path:
-        key = f'{signature} {codegen.magic_tuple()}'  # the second is the processor
-        digest = hashlib.sha256(key.encode()).hexdigest()[:16]
-        return self.cache_path / f'{self._name}-{digest}'
-
-    def _list(self, path: Path) -> None:
-        """Write the list of files that a frame needs, once each function has one."""
-        _kept[self._name] = path.name
-        if len(_kept) == len(_entry_points) and not is_code_kept():
-            with contextlib.suppress(OSError):
-                _write_whole(self.cache_path / _ALL, '\n'.join(_kept.values()).encode())
+            return found
+    _begin_turn(folder)
+    log_once(logging.INFO, 'compiling for this processor, which takes 20 to 60 s')
+    return None
 
 
-def _read_whole(path: Path) -> bytes | None:
-    """Return what `_write_whole` was given; None if the file is missing or damaged."""
+def _save(save: Callable[..., Any], folder: Path, checksum: Path, *arguments: Any) -> None:
+    """Let numba `save` what it has compiled; a full disk is a warning."""
     try:
-        content = path.read_bytes()
-    except OSError:
-        return None
-    checksum, data = content[:_CHECKSUM_SIZE], content[_CHECKSUM_SIZE:]
-    return data if hashlib.sha256(data).digest() == checksum else None
+        save(*arguments)
+        checksum.write_bytes(_digest_of(checksum))
+        _list(folder, checksum)
+    except OSError as error:
+        _log_not_kept(error)
+    finally:
+        _end_turn()
 
 
-def _write_whole(path: Path, data: bytes) -> None:
-    """Write a file with its checksum, at once."""
-    unfinished = path.with_name(f'{path.name}.tmp{os.getpid()}')
+def _files_of(checksum: Path) -> list[Path]:
+    """Return the files in which numba keeps the code of a function."""
+    name = glob.escape(checksum.name.removesuffix(_CHECKSUM))
+    return sorted(checksum.parent.glob(f'{name}-*.nb[ic]'))
+
+
+def _digest_of(checksum: Path) -> bytes:
+    digest = hashlib.sha256()
+    for path in _files_of(checksum):
+        digest.update(path.name.encode() + b'\0' + path.read_bytes())
+    return digest.digest()
+
+
+def _is_whole(checksum: Path) -> bool:
+    """Whether the files of a function are those that were written."""
     try:
-        with unfinished.open('wb') as file:
-            file.write(hashlib.sha256(data).digest() + data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(unfinished, path)
+        return checksum.read_bytes() == _digest_of(checksum)
     except OSError:
-        unfinished.unlink(missing_ok=True)
-        raise
+        return False
+
+
+def _list(folder: Path, checksum: Path) -> None:
+    """Write the list of checksums that a frame needs, once each function has one."""
+    _kept.add(str(checksum.relative_to(folder)))
+    if len(_kept) == len(_entry_points) and not is_code_kept():
+        with contextlib.suppress(OSError):
+            (folder / _ALL).write_text('\n'.join(sorted(_kept)))
 
 
 def _begin_turn(folder: Path) -> None:
@@ -240,7 +248,7 @@ def _end_turn() -> None:
         _turn = None
 
 
-def _log_not_kept(reason: Exception) -> None:
+def _log_not_kept(reason: object) -> None:
     log_once(
         logging.WARNING,
         'compiled code is not kept on disk (%s): every start compiles, which takes 20 to 60 s; '
@@ -301,7 +309,10 @@ def has_to_compile() -> bool:
 def is_code_kept() -> bool:
     """Whether all code that a frame needs lies on disk, whole."""
     folder = code_folder()
-    names = folder and _read_whole(folder / _ALL)
-    if not (folder and names):
+    if folder is None:
         return False
-    return all(_read_whole(folder / name) is not None for name in names.decode().splitlines())
+    try:
+        names = (folder / _ALL).read_text().splitlines()
+    except (OSError, UnicodeError):
+        return False
+    return bool(names) and all(_is_whole(folder / name) for name in names)
