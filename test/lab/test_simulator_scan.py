@@ -333,3 +333,41 @@ def test_numbers_and_heights_of_objects():
     none, car, truck, box = objects.object_heights(hill, solids)
     assert (car, truck, box) == pytest.approx((1.5, 3.6, 0.3)) and math.isnan(none)
     assert len(objects.object_heights(hill, ())) == 1
+
+
+MEASURES = {
+    # Solids, objects, heights of the lowest and of the highest object [m], slopes of half of the
+    # ground and of the steepest [degrees].
+    'flat': (65, 12, 1.500, 1.500, 0.00, 0.00),
+    'slope': (64, 12, 1.500, 1.500, 4.57, 4.57),
+    'ramp': (61, 12, 1.500, 1.500, 0.00, 6.84),
+    'rough': (64, 12, 1.500, 1.500, 2.56, 7.08),
+    'road_then_rubble': (64, 12, 1.500, 1.500, 0.00, 36.44),
+    'kerb': (64, 12, 1.500, 1.500, 0.00, 71.57),
+    'ditch': (61, 12, 1.500, 1.500, 0.00, 38.66),
+    'crest': (64, 12, 1.500, 1.500, 0.00, 4.57),
+    'urban': (255, 33, 1.500, 3.600, 0.00, 71.57),
+    'traffic_jam': (661, 112, 1.450, 3.600, 0.00, 71.57),
+    'car_park': (1554, 263, 1.474, 1.731, 0.73, 0.73),
+    'hidden_climb': (105, 20, 1.450, 1.946, 0.00, 5.76),
+    'wet_road': (661, 112, 1.450, 3.600, 0.00, 71.57),
+    'blind_slope': (64, 12, 1.500, 1.500, 7.51, 7.51),
+    'low_boxes': (40, 40, 0.200, 0.600, 0.00, 0.00),
+    'low_boxes_rough': (40, 40, 0.200, 0.600, 2.56, 7.08),
+    'lying_persons': (35, 35, 0.220, 0.220, 0.00, 0.00),
+    'hills': (52, 12, 0.404, 2.142, 10.16, 29.84),
+    'valley': (60, 16, 0.402, 2.437, 5.28, 23.28),
+    'bank': (60, 16, 0.434, 1.928, 1.46, 17.46),
+    'on_ramp': (52, 12, 0.426, 1.948, 0.70, 13.43),
+    'dike': (60, 16, 0.404, 1.700, 1.36, 27.50),
+}
+
+
+@pytest.mark.parametrize('name', SCENES)
+def test_every_scene_has_its_measures(name):
+    scene = scene_of(name, 0)
+    at = np.random.default_rng(0).uniform(-40.0, 40.0, (2, 4000)).T
+    degrees = np.degrees(np.arctan(np.linalg.norm(scene.terrain.gradient(at), axis=1)))
+    _, *heights = objects.object_heights(scene.terrain, scene.solids)
+    found = len(scene.solids), len(heights), min(heights), max(heights)
+    assert (*found, np.median(degrees), degrees.max()) == pytest.approx(MEASURES[name], abs=0.01)
