@@ -210,7 +210,9 @@ def _start_workers(n_workers: int) -> Iterator[Any]:
     with ExitStack() as stack:
         # Without the pages that would show others on this machine what is computed.
         pages = ('distributed.scheduler.http.routes', 'distributed.worker.http.routes')
-        stack.enter_context(dask.config.set(dict.fromkeys(pages, ())))
+        # Nor with settings of malloc, which would take the memory of each frame from the system.
+        settings = {**dict.fromkeys(pages, ()), 'distributed.nanny.pre-spawn-environ': {}}
+        stack.enter_context(dask.config.set(settings))
         with _ctrl_c_kept():
             cluster = distributed.LocalCluster(
                 n_workers=0,  # they start below: Ctrl-C does not wait for them

@@ -43,10 +43,13 @@ def locked_scheduler():
         'distributed.comm.tls.client.cert': security.tls_client_cert,
         'distributed.comm.tls.client.key': security.tls_client_key,
     }
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address='127.0.0.1:0', security=security,
-        silence_logs=logging.CRITICAL,
-    ) as started:  # fmt: skip
+    with (
+        dask.config.set({'distributed.nanny.pre-spawn-environ': {}}),  # of this process, too
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address='127.0.0.1:0',
+            security=security, silence_logs=logging.CRITICAL,
+        ) as started,
+    ):  # fmt: skip
         yield started.scheduler_address, config
 
 
@@ -92,12 +95,15 @@ def test_reports_are_the_same_to_the_last_digit(line, root, scheduler, tmp_path,
 
 def test_labels_are_the_same_with_any_number_of_workers(root, scheduler, tmp_path, capsys):
     assert run('segment', root, '-o', tmp_path / '0') == 0
+    before = dict(os.environ)
     for n, words in (('1', ['--workers', '1']), ('2', ['--scheduler', scheduler])):
         assert run('segment', root, '-o', tmp_path / n, *words) == 0
         said = capsys.readouterr()
         assert f'in each of {n} worker' in said.out
         assert said.err == '' or '--scheduler' in words
         assert label_files(tmp_path / n) == label_files(tmp_path / '0')
+    # Dask sets variables of malloc, with which each frame takes its memory from the system.
+    assert dict(os.environ) == before
     for name in ('00', '08'):
         assert run('segment', root / 'sequences' / name, '-o', tmp_path / 'alone') == 0
         of_sequence = tmp_path / f'0/sequences/{name}/predictions'
