@@ -211,7 +211,10 @@ def _start_workers(n_workers: int) -> Iterator[Any]:
         # Without the pages that would show others on this machine what is computed.
         pages = ('distributed.scheduler.http.routes', 'distributed.worker.http.routes')
         # Nor with settings of malloc, which would take the memory of each frame from the system.
-        settings = {**dict.fromkeys(pages, ()), 'distributed.nanny.pre-spawn-environ': {}}
+        settings: dict[str, Any] = {
+            **dict.fromkeys(pages, ()),
+            'distributed.nanny.pre-spawn-environ': {},
+        }
         stack.enter_context(dask.config.set(settings))
         with _ctrl_c_kept():
             cluster = distributed.LocalCluster(
