@@ -271,6 +271,29 @@ def _blind_slope(seed: int) -> Scene:
     return Scene('blind_slope', terrain, _scattered(terrain, rng))
 
 
+def _hedge(seed: int) -> Scene:
+    """Path between dense hedges 0.5 to 0.8 m high, with a fence behind one of them."""
+    rng = np.random.default_rng(seed)
+    terrain = rough(rng, 0.02, (1.5, 10.0))
+    solids: list[Solid] = []
+    side = rng.choice([-1.0, 1.0])
+    for y in (side * rng.uniform(3.0, 6.0), -side * rng.uniform(3.0, 6.0)):
+        high, deep = rng.uniform(0.55, 0.75), rng.uniform(0.6, 1.2)
+        for x in np.arange(-30.0, 50.0, 0.25).tolist():
+            # Leaves stick out by some centimetres.
+            size = (0.27, deep + rng.uniform(-0.15, 0.15), high + rng.uniform(-0.05, 0.05))
+            at = x, y + rng.uniform(-0.05, 0.05)
+            solids.append(objects.standing_box(terrain, *at, size, kind=Kind.VEGETATION))
+    fence = side * rng.uniform(8.0, 10.0)
+    for x in np.arange(-40.0, 60.0, 2.0).tolist():
+        solids.append(objects.pole(terrain, x, fence, 1.3, 0.05))
+        for clearance in (0.52, 0.82, 1.12):
+            rail = objects.floating_box(terrain, x + 1.0, fence, (2.0, 0.04, 0.12), clearance)
+            solids.append(rail)
+    solids += traffic.person(terrain, rng.uniform(5.0, 15.0), rng.uniform(-1.0, 1.0))
+    return Scene('hedge', terrain, tuple(solids))
+
+
 def _around(
     smooth: Terrain,
     terrain: Terrain,
@@ -423,6 +446,7 @@ _CROWDED = {
     'hidden_climb': _hidden_climb,
     'wet_road': _wet_road,
     'blind_slope': _blind_slope,
+    'hedge': _hedge,
 }
 LOW: dict[str, Callable[[int], Scene]] = {
     name: functools.partial(_low_scene, name) for name in _LOW_OBJECTS
