@@ -26,10 +26,12 @@ from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.parameters.schema import NO_BOX
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
 from gp_ground_seg.core.pipeline.mirror_images import (
+    MAYBE_MIRRORED,
+    MIRRORED,
     MirrorImages,
     find_mirror_images,
     in_sight,
-    is_mirror,
+    mirror_share,
 )
 from gp_ground_seg.core.pipeline.points import (
     ENOUGH_POINTS,
@@ -53,7 +55,6 @@ from gp_ground_seg.core.pipeline.up_axis import (
     View,
     clearest,
     is_doubtful,
-    may_be_image,
     view_of,
 )
 from gp_ground_seg.core.result import Segmentation
@@ -253,11 +254,9 @@ class GroundSegmenter:
         scan = backend.build_grid(level, config)
         timer.mark('grid')
         origin, elsewhere = origin_of(sensor), None
-        seen, below = scan, self._look(scan, UPRIGHT, origin)
-        if may_be_image(below):
-            seen, below = self._past_images(scan, below, origin)
+        below, seen = self._past_images(scan, self._look(scan, UPRIGHT, origin), origin)
         view = below
-        if seen is scan and is_doubtful(below):
+        if is_doubtful(below):
             view = self._find_ground(level, below, origin)
         if view is not None and not view.can_level:
             # The scan will not be levelled: the ground that matters is about level.
@@ -268,7 +267,7 @@ class GroundSegmenter:
             pose = with_fallback(pose, fallback, sensor)
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
             scan = backend.build_grid(pose.level(xyz), config)
-        images = find_mirror_images(scan, pose, sensor, backend.is_wet)
+        images = find_mirror_images(scan, pose, sensor)
         if len(images.points) > 0:
             scan = images.left_out(backend.build_grid(images.raised(scan.xyz), config))
         timer.mark('pose')
@@ -276,16 +275,22 @@ class GroundSegmenter:
 
     def _past_images(
         self, scan: Scan, below: View | None, origin: Direction
-    ) -> tuple[Scan, View | None]:
-        """Scan of the candidates that are no mirror images, and their plane, if it is a mirror.
+    ) -> tuple[View | None, Scan]:
+        """View of a mirror: by the candidates that are no images of it, if these show one.
 
-        Else the scan as it is, and the plane `below`.
+        Else `below`, and the scan as it is.
         """
+        share = 1.0
+        if below is not None:
+            share = mirror_share(below.plane, scan)
+            below = below._replace(is_mirror=share >= MIRRORED)
+            if share < MAYBE_MIRRORED and not below.may_be_image:
+                return below, scan
         left = scan._replace(candidates=in_sight(scan.candidates, origin[2]))
         view = self._look(left, UPRIGHT, origin)
-        if view is None or not (view.tells_height and is_mirror(view.plane, scan, origin)):
-            return scan, below
-        return left, view
+        if view is not None and view.is_whole and mirror_share(view.plane, scan) >= MIRRORED:
+            return view._replace(is_mirror=True), left
+        return below, scan
 
     def _look(
         self, scan: Scan, turn: FloatArray, origin: Direction, max_tilt: float = MAX_TILT

@@ -8,15 +8,13 @@ from conftest import simulated
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
-from gp_ground_seg.core.compiled.backend import NumbaBackend
-from gp_ground_seg.core.frame import Candidates, Label
+from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.pipeline.ground_plane import fit_plane
 from gp_ground_seg.core.pipeline.mirror_images import (
     DEEP,
     find_mirror_images,
     in_sight,
-    is_mirror,
-    is_wet,
+    mirror_share,
 )
 from gp_ground_seg.lab.simulation import SENSORS
 
@@ -29,7 +27,7 @@ def images_in(points, sensor):
     config = dataclasses.replace(Config(), sensor=sensor)
     pose = GroundSegmenter(config).segment(points).pose
     scan = NumpyBackend().build_grid(pose.level(np.ascontiguousarray(points[:, :3])), config)
-    found = find_mirror_images(scan, pose, sensor, is_wet)
+    found = find_mirror_images(scan, pose, sensor)
     is_image = np.zeros(len(points), dtype=bool)
     is_image[found.points] = True
     return is_image, found
@@ -81,20 +79,6 @@ def test_images_are_told_by_where_rays_start():
     assert not images_in(lifted, Config().sensor)[0].any()
     aside = Config().replace(**{'sensor.origin_x': 0.5}).sensor
     assert not images_in(points, aside)[0].any()
-
-
-def test_backends_agree_on_which_road_is_wet():
-    rng = np.random.default_rng(0)
-    found = []
-    for _ in range(300):
-        number = rng.integers(0, 30, size=6)
-        candidates = Candidates.buffers(number.sum(), len(number))
-        candidates.offsets[:] = np.append(0, np.cumsum(number))
-        candidates.r[:] = np.concatenate([np.sort(rng.uniform(0.2, 25.0, n)) for n in number])
-        candidates.z[:] = -1.7 + rng.normal(0.0, rng.choice([0.02, 0.3], number.sum()))
-        found.append(NumpyBackend().is_wet(candidates, -1.7, 0.1))
-        assert NumbaBackend().is_wet(candidates, -1.7, 0.1) == found[-1]
-    assert 30 < sum(found) < 270
 
 
 def hall(height, steepest, *, is_polished=False, has_tables=False):
@@ -149,11 +133,5 @@ def test_a_polished_floor_is_a_mirror_and_tables_are_not():
         scan = NumpyBackend().build_grid(hall(height, steepest, **kind)[0], Config())
         plane = fit_plane(in_sight(scan.candidates, 0.0), 1.0, origin)
         assert -plane.height == pytest.approx(plane_z, abs=0.03)
-        assert is_mirror(plane, scan, origin) == ('is_polished' in kind)
-        # The best plane is that of the ceiling's image, or of the floor below the tables.
-        seen_through = fit_plane(scan.candidates, 1.0, origin).seen_through
-        assert (seen_through > 0.9) == bool(kind)
-        # Much of the floor lies below the line of sight to tables that are nearer.
-        assert is_wet(scan.candidates, plane_z, 0.0) == bool(kind)
-        # Where rays start must be known.
-        assert not is_mirror(plane, scan, (0.5, 0.0, 0.0))
+        share = mirror_share(plane, scan)
+        assert share > 0.6 if 'is_polished' in kind else share < 0.1, share

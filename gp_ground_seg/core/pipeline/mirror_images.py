@@ -10,14 +10,11 @@ Where images are the lowest returns of most cells, the plane of the ground is lo
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.core.frame import (
-    BoolArray,
     Candidates,
     FloatArray,
     IntArray,
@@ -27,9 +24,8 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import SensorConfig
-from gp_ground_seg.core.pipeline.ground_plane import GroundPlane, crossed_at, tolerance_at
-from gp_ground_seg.core.pipeline.low_sensor import is_seen_from_sensor, is_seen_steeply
-from gp_ground_seg.core.pipeline.points import Direction
+from gp_ground_seg.core.pipeline.ground_plane import GroundPlane, tolerance_at
+from gp_ground_seg.core.pipeline.low_sensor import is_seen_from_sensor
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
 DEEP = 0.15
@@ -46,16 +42,14 @@ told [m]: nearer there may be the robot itself."""
 N_ASIDE = 4
 """Segments on each side whose ground tells the images of a segment."""
 WET_SHARE, WET_REACH = 0.1, 20.0
-"""Images among the candidates for each on the plane, both up to this range [m], from which a road
-is wet: of dry scans the most was 0.07, of wet ones the least 0.14."""
-MIRRORED = 0.7
-"""Share of what is deep below a mirror that is seen through returns on it: of dry scans the most
-was 0.57, of wet ones, but for those of rough ground, the least 0.81."""
-RING, LEAST_RANGE, N_BEHIND = 0.03, 0.1, 8
-"""Width of the rings in which these returns are looked for, in parts of the range, and least range
-that is told [m]: in that where a ray to an image crosses the mirror or the next on either side,
-and in one of those behind these, up to this number behind the first."""
-IsWet = Callable[[Candidates, float, float], bool]
+"""Candidates deep below the plane for each on it, both up to this range [m], from which they are
+asked for what they are images of."""
+COUNTERPART = 0.2
+"""Distance of a raised image to what it is an image of, at most about this [m]."""
+MIRRORED, MAYBE_MIRRORED = 0.4, 0.12
+"""Share of what is deep below a plane that has a counterpart over it, from which the plane is a
+mirror, and from which it may be one that is not quite found: of dry scans the most was 0.08, of
+wet ones 0.7 to 0.96, and 0.2 to 0.45 with a wrong plane."""
 
 
 class MirrorImages(NamedTuple):
@@ -79,21 +73,18 @@ class MirrorImages(NamedTuple):
         return scan._replace(candidates=candidates.where(~is_image))
 
 
-def find_mirror_images(
-    scan: Scan, pose: SensorPose, sensor: SensorConfig, is_wet: IsWet
-) -> MirrorImages:
+def find_mirror_images(scan: Scan, pose: SensorPose, sensor: SensorConfig) -> MirrorImages:
     """Find the mirror images of a scan in the level frame: none unless the road is wet.
 
     Where rays start must be known: at the origin of the cloud, or above or below it at that of the
-    parameters, and above the plane. Else there are none. `is_wet` is that of this module, or
-    compiled.
+    parameters, and above the plane. Else there are none.
     """
     none = MirrorImages(np.zeros(0, dtype=np.int64), np.zeros(0))
     x, y, up = (pose.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)).tolist()
     if not is_seen_from_sensor(pose) or (x, y) != (0.0, 0.0):
         return none
     grid, plane_z = scan.grid, -pose.height
-    if not (up > plane_z and is_wet(scan.candidates, plane_z, up)):
+    if not (up > plane_z and mirror_share(GroundPlane(pose.height), scan) >= MIRRORED):
         return none
     inside = np.flatnonzero(grid.inside)
     r, z = grid.r[inside].astype(np.float64), scan.xyz[inside, 2].astype(np.float64)
@@ -105,19 +96,32 @@ def find_mirror_images(
     return MirrorImages(inside[found], -2.0 * (z[found] + pose.height))
 
 
-def is_wet(candidates: Candidates, plane_z: float, sensor_z: float) -> bool:
-    """Whether many candidates are images; heights are those of the ground and the sensor [m]."""
+@np.errstate(invalid='ignore', over='ignore')
+def mirror_share(plane: GroundPlane, scan: Scan) -> float:
+    """Share of what is deep below a plane that is the image of another return; 0 if little is.
+
+    A wet road mirrors what stands on it: raised over the road again, its image meets other returns
+    of it. What is seen of a valley, or below a table or a dock, meets none.
+    """
+    candidates = scan.candidates
     near = np.flatnonzero((candidates.r >= NEAREST) & (candidates.r < WET_REACH))
-    r, z = candidates.r[near], candidates.z[near]
-    is_ground = is_on_plane(r, z, plane_z)
-    most_if_dry = WET_SHARE * np.count_nonzero(is_ground)
-    # Even if all that is deep were an image, the road would be dry.
-    if np.count_nonzero(z < plane_z - DEEP) <= most_if_dry:
-        return False
-    slope = slope_of_sight(r, z, sensor_z)
-    nearer = _nearer_in_segment(slope, is_ground, candidates.segment[near])
-    found = is_image(r, z, slope, nearer, plane_z, sensor_z, BELOW_SIGHT)
-    return bool(np.count_nonzero(found) > most_if_dry)
+    place = np.column_stack([candidates.x, candidates.y, candidates.z])[near]
+    over = plane.below(*place.T)
+    deep, n_ground = over < -DEEP, np.count_nonzero(np.abs(over) <= tolerance_at(candidates.r[near]))
+    if np.count_nonzero(deep) <= WET_SHARE * n_ground:
+        return 0.0
+    normal = np.array(plane.normal)
+    raised = place[deep] - (2.0 * over[deep] * normal[2])[:, None] * normal
+    # Boxes with a return, and a margin of one on all sides.
+    low = raised.min(axis=0) - 2.0 * COUNTERPART
+    shape = ((raised.max(axis=0) - low) / COUNTERPART).astype(np.int64) + 3
+    inside = ((scan.xyz > low) & (scan.xyz < low + COUNTERPART * shape)).all(axis=1)
+    inside &= plane.below(*scan.xyz.T) > DEEP
+    has_return = np.zeros(shape, dtype=np.bool_)
+    has_return[tuple(((scan.xyz[inside] - low) / COUNTERPART).astype(np.int64).T)] = True
+    box = ((raised - low) / COUNTERPART).astype(np.int64)
+    steps = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 1, 3)
+    return float(has_return[tuple((box + steps).T)].any(axis=1).mean())
 
 
 def in_sight(candidates: Candidates, sensor_z: float) -> Candidates:
@@ -132,45 +136,6 @@ def in_sight(candidates: Candidates, sensor_z: float) -> Candidates:
     tells = np.flatnonzero((candidates.r >= NEAREST) & (slope < 0.0))
     nearer = _nearer_about(slope[tells], cell[tells], shape, 1)[cell]
     return candidates.where((slope < 0.0) & (slope >= nearer))
-
-
-@np.errstate(invalid='ignore', over='ignore')
-def is_mirror(plane: GroundPlane, scan: Scan, origin: Direction) -> bool:
-    """Whether much is deep below a plane, and most of it is seen through returns on the plane.
-
-    Of rays that meet a wet floor side by side some come back from it, others from what they are
-    mirrored to, and it goes on behind. Rays below a table cross its plane where there is none; the
-    land ends where rays pass over an edge. `origin` is where rays start [m].
-    """
-    if origin[:2] != (0.0, 0.0) or not is_seen_steeply(plane):
-        return False
-    grid, candidates = scan.grid, scan.candidates
-    near = np.flatnonzero((candidates.r >= NEAREST) & (candidates.r < WET_REACH))
-    r, over = candidates.r[near], plane.below(candidates.x, candidates.y, candidates.z)[near]
-    deep, n_ground = over < -DEEP, np.count_nonzero(np.abs(over) <= tolerance_at(r))
-    if np.count_nonzero(deep) <= WET_SHARE * n_ground:
-        return False
-    crossing = crossed_at(r[deep], over[deep], plane.below(*origin))
-    # Points in no cell have no place on the plane: NaN, or a range beyond the last edge.
-    farthest = min(math.exp((N_BEHIND + 1) * RING) * float(crossing.max()), float(grid.edges[-1]))
-    is_on_it = np.abs(plane.below(*scan.xyz.T)) <= tolerance_at(grid.r)
-    on_it = np.flatnonzero(is_on_it & (grid.r < farthest))
-    # Empty behind the last ring, and so before the first.
-    n_rings = _ring_at(grid.edges[-1]) + N_BEHIND + 2
-    has_return = np.zeros((grid.n_segments, n_rings), dtype=np.bool_)
-    has_return[grid.cell[on_it] // grid.n_bins, _ring_at(grid.r[on_it])] = True
-    segment, ring = candidates.segment[near[deep]], _ring_at(crossing)
-    beside, behind = (
-        np.any([has_return[segment, ring + step] for step in steps], axis=0)
-        for steps in (range(-1, 2), range(2, N_BEHIND + 1))
-    )
-    n_images = np.count_nonzero(beside & behind)
-    return bool(n_images > max(WET_SHARE * n_ground, MIRRORED * len(crossing)))
-
-
-def _ring_at(r: Values) -> Any:
-    """Return the number of the ring at a range [m]; each is wider by `RING` than the last."""
-    return (np.log(np.maximum(r, LEAST_RANGE) / LEAST_RANGE) / RING).astype(np.int64)
 
 
 @shared
@@ -203,20 +168,6 @@ def is_image(
     # Only a line of sight that points down meets the plane: at its height over its slope.
     may_be = (z < plane_z - DEEP) & (r >= NEAREST) & (r < IMAGE_REACH) & (nearer < 0.0)
     return may_be & ((nearer - slope) * (sensor_z - plane_z) > -least * nearer)
-
-
-def _nearer_in_segment(slope: FloatArray, is_ground: BoolArray, segment: IntArray) -> FloatArray:
-    """Highest slope to ground that is nearer in the segment of each candidate, (C,); else -inf."""
-    if len(slope) == 0:
-        return slope
-    # The slopes of each segment are above all of the one before it.
-    apart = 2.0 * float(np.abs(slope).max()) + 1.0
-    base = apart * segment
-    highest = np.maximum.accumulate(np.where(is_ground, slope + base, base - apart / 2.0))
-    result = np.full(len(slope), -np.inf)
-    result[1:] = highest[:-1] - base[1:]
-    result[result <= -apart / 2.0] = -np.inf
-    return result
 
 
 def _nearer_about(

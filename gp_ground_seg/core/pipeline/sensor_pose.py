@@ -29,7 +29,6 @@ from gp_ground_seg.core.pipeline.points import (
     vertical,
 )
 from gp_ground_seg.core.pipeline.up_axis import (
-    MIN_COVERAGE,
     View,
     is_well_supported,
     refusal,
@@ -50,10 +49,6 @@ LOW_GROUND = (
 LEAST_DEPRESSION = 0.06
 """Angle below the horizontal at which a sensor sees the nearest tenth of a plane that it is less
 than `LOW` above [rad]. The origin of a vehicle is as low, but sees no ground that near."""
-FEW_CELLS = 45
-"""Cells on the plane below which its height is doubtful. Whole scans that show the height have
-more; parts of a scan, up to 60 degrees wide, have fewer, or less than `MIN_COVERAGE` of the
-sectors."""
 LITTLE_GROUND = (
     'the scan shows little ground near the sensor, and the height estimated from it may be wrong: '
     'set sensor.height'
@@ -240,11 +235,10 @@ def with_fallback(pose: SensorPose, fallback: SensorPose, sensor: SensorConfig) 
 def _doubts(sensor: SensorConfig, view: View) -> tuple[str, ...]:
     """Say why the height of the plane of `view` may not be that of the ground."""
     plane = view.plane
-    is_little = plane.n_support < FEW_CELLS or plane.coverage < MIN_COVERAGE
     clearance = plane.near_height * plane.normal[2] + _product(view.up, origin_of(sensor))
     is_low = 0.0 < clearance < LOW and plane.depression >= LEAST_DEPRESSION
     # A boolean of numpy does not multiply a tuple.
-    return (LOW_GROUND,) * bool(is_low) + (LITTLE_GROUND,) * bool(is_little)
+    return (LOW_GROUND,) * bool(is_low) + (LITTLE_GROUND,) * (not view.is_whole)
 
 
 @lru_cache(maxsize=4)

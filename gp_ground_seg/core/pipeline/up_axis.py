@@ -24,9 +24,12 @@ MIN_CLEARANCE, MIN_SPREAD = 0.05, 0.06
 MIN_DEPTH = 2.5
 """Points on it one behind the other (`GroundPlane.depth`) that do without both: the lowest beam on
 walls, or a scan of one beam, gives one or two, 2.3 in a corridor; ground gives three and more."""
-SHALLOW, SHALLOW_SPREAD = 2.0, 0.03
-"""The same of ground that is seen at angles so far apart [rad], as the floor of a small room: one
-beam on walls is seen at one."""
+FEW_CELLS = 45
+"""Cells on the plane below which its height is doubtful. Whole scans that show the height have
+more; parts of a scan, up to 60 degrees wide, have fewer, or less than `MIN_COVERAGE` of the
+sectors."""
+CONE_SPREAD = 0.025
+"""Spread [rad] below which what looks like a plane is one beam on walls."""
 MIN_COVERAGE = 0.25
 """Share of the sectors with ground in them from which a scan determines the tilt."""
 MIN_REACH = 5.0
@@ -35,23 +38,20 @@ MIN_REACH = 5.0
 MAX_TILT = math.radians(46.0)
 """Angle from an axis within which a plane is searched; such cones about the six axes cover all
 directions. A scan whose ground is farther from z than that is not levelled but refused."""
+OVERHUNG = 0.75
+"""`GroundPlane.overhung` from which a plane may be that of a reflected ceiling."""
 STEEP = math.radians(25.0)
 """Tilt from which a plane is fitted again in a frame in which it is level: lowest points of a
 tilted frame are not all ground."""
-SEEN_THROUGH = 0.75
-"""`GroundPlane.seen_through` from which a plane may lie below the ground."""
 GOOD_SUPPORT = 0.9
 """Support of a `TALL` plane below z under which other axes are tried."""
 TALL = 6.0
 """Height from which the plane below z may well be a facade [m]."""
 SUPPORT_RATIO = 0.8
 """Least support of another plane over that of the plane below z."""
-DISTANCE_RATIO = 3.0
-"""Distance of a `TALL` plane over the largest of another one."""
-OTHER_MIN_SUPPORT = 0.5
-"""Support from which a plane that is not below z shows where the ground is."""
-OTHER_MIN_FAR_COVERAGE = 0.5
-"""Share of the sectors in which it must reach far: the ceiling of a room does not."""
+OTHER_MIN_SUPPORT, OTHER_MIN_REACH = 0.5, 10.0
+"""Support, and range that it reaches [m], from which a plane that is not below z shows where the
+ground is: walls and ceilings of rooms seldom do."""
 CLEAR = 0.3
 """Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
 seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
@@ -82,6 +82,7 @@ class View(NamedTuple):
     plane: GroundPlane
     turn: FloatArray  # (3, 3) rotation to that frame from the one levelled by the parameters
     clearance: float  # how far the plane is below the sensor there [m]
+    is_mirror: bool = False  # whether what is below it are mirror images
 
     @property
     def up(self) -> Direction:
@@ -92,6 +93,11 @@ class View(NamedTuple):
     def levelled(self) -> FloatArray:
         """Rotation (3, 3) as `turn`, to a frame in which the plane is level."""
         return rotation(*angles_of(self.up))
+
+    @property
+    def may_be_image(self) -> bool:
+        """Whether it may be a mirror image, as of the ceiling in a polished floor."""
+        return self.plane.overhung >= OVERHUNG or not is_well_supported(self.plane)
 
     @property
     def is_steep(self) -> bool:
@@ -109,27 +115,35 @@ class View(NamedTuple):
         return self.tells_tilt and self.up[2] >= math.cos(MAX_TILT)
 
     @property
-    def tells_height(self) -> bool:
-        """Whether it is ground for sure."""
-        plane, is_below = self.plane, self.clearance >= MIN_CLEARANCE
-        is_seen_from_above = is_below and plane.spread >= MIN_SPREAD
-        is_floor = is_below and plane.spread >= SHALLOW_SPREAD and plane.depth >= SHALLOW
+    def is_surface(self) -> bool:
+        """Whether it is ground for sure: seen at several angles, or several rows deep."""
+        plane = self.plane
+        is_wide = plane.support >= MIN_SUPPORT and plane.coverage >= MIN_COVERAGE
         return plane.n_support >= MIN_CELLS and (
-            is_seen_from_above
-            or (
-                plane.support >= MIN_SUPPORT
-                and plane.coverage >= MIN_COVERAGE
-                and (plane.depth >= MIN_DEPTH or is_floor)
-            )
+            (self.clearance >= MIN_CLEARANCE and plane.spread >= MIN_SPREAD)
+            or (is_wide and plane.depth >= MIN_DEPTH)
         )
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether so much of it is seen that it is not to be doubted."""
+        plane = self.plane
+        return self.is_surface and plane.n_support >= FEW_CELLS and plane.coverage >= MIN_COVERAGE
+
+    @property
+    def tells_height(self) -> bool:
+        """Whether it may be ground; doubtful, unless it is for sure."""
+        plane = self.plane
+        is_seen = plane.spread >= CONE_SPREAD or not math.isnan(plane.other_height)
+        return self.is_surface or (is_seen and self.clearance >= MIN_CLEARANCE)
 
     @property
     def tells_tilt(self) -> bool:
         """Whether it is enough ground to tell the tilt."""
         plane = self.plane
         return (
-            self.tells_height
-            and is_well_supported(plane)
+            self.is_surface
+            and (is_well_supported(plane) or self.is_mirror)
             and plane.coverage >= MIN_COVERAGE
             and plane.reach >= MIN_REACH
         )
@@ -154,31 +168,22 @@ def is_doubtful(below: View | None) -> bool:
     return (
         below is None
         or below.is_steep
-        or not is_well_supported(below.plane)
+        or not (is_well_supported(below.plane) or below.is_mirror)
         or (below.is_tall and below.plane.support < GOOD_SUPPORT)
     )
 
 
-def may_be_image(below: View | None) -> bool:
-    """Whether the plane below z may be a mirror image, as of the ceiling in a polished floor."""
-    return below is None or is_doubtful(below) or below.plane.seen_through >= SEEN_THROUGH
-
-
 def clearest(below: View | None, others: Iterable[View]) -> View | None:
     """Return the one of `others` that clearly is the ground, if `below`, about z, is not."""
-    support, farthest = OTHER_MIN_SUPPORT, math.inf
-    if below is not None:
-        support = max(support, SUPPORT_RATIO * below.plane.support)
-        farthest = below.plane.height / DISTANCE_RATIO if below.is_tall else farthest
+    support = SUPPORT_RATIO * below.plane.support if below is not None else 0.0
     found = [
         view
         for view in others
         if view.tells_tilt
         # No ground is above the sensor: roofs of cars, of whose ground little is seen, are.
-        and view.clearance >= -MIN_CLEARANCE
-        and view.plane.height <= farthest
-        and view.plane.support >= support
-        and view.plane.far_coverage >= OTHER_MIN_FAR_COVERAGE
+        and -MIN_CLEARANCE <= view.clearance <= TALL
+        and view.plane.support >= max(support, OTHER_MIN_SUPPORT)
+        and view.plane.reach >= OTHER_MIN_REACH
     ]
     return max(found, key=lambda view: view.plane.support, default=below)
 
