@@ -16,7 +16,7 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.errors import DataError, PointCloudError
 from gp_ground_seg.core.parameters.config import SensorConfig
 from gp_ground_seg.data.semantic_kitti import labelled_frames
-from gp_ground_seg.lab.scenes import SimulatedFrame, load_simulated
+from gp_ground_seg.lab.experiments import SimulatedFrame, load_scan
 from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.scoring import metrics
 from gp_ground_seg.lab.scoring.evaluate import STAGE, OurMethod, sums, with_all
@@ -160,7 +160,7 @@ def test_ours_is_the_library(tmp_path):
 
 
 def run_peer(scene, sensor='vlp-16', **options):
-    scan = load_simulated(SimulatedFrame(sensor, scene, 0, 0.0))
+    scan = load_scan(SimulatedFrame(sensor, scene, 0))
     method = PatchworkppMethod(**options)
     method.run(scan.points)
     return scan, method
