@@ -162,15 +162,9 @@ def label_layers(label: Labels, truth: Labels | None = None) -> tuple[str, Layer
 CANDIDATE_COLOUR = '#56636E'
 LINE_COLOUR, SURFACE_COLOUR, PSEUDO_INPUT_COLOUR = GREEN, '#111111', VIOLET
 
-# Metres kept free below and above the ground, and beyond the last candidate; and the distance
-# from the ground up to which a candidate is always in the picture.
-BELOW, ABOVE, BEYOND, NEAR_GROUND = 0.25, 0.9, 2.0, 1.0
+# Metres kept free below and above the ground, and beyond the last candidate.
+BELOW, ABOVE, BEYOND = 0.4, 0.9, 2.0
 N_OF_LINE = 16  # places at which a line is drawn over the relief
-
-
-def segment_at(azimuth: float, n_segments: int) -> int:
-    """Return the segment towards an azimuth [rad], counter-clockwise from x."""
-    return math.floor((azimuth / math.tau + 0.5) * n_segments) % n_segments
 
 
 def plot_segment(
@@ -203,7 +197,7 @@ def plot_segment(
         view.draw_length_scale(below, config)
         title = ''
     reach = max(view.reach() for view in views)
-    lows, highs = zip(*(view.heights_shown(reach) for view in views), strict=True)
+    lows, highs = zip(*(view.heights_shown() for view in views), strict=True)
     panels[0, 0].set_xlim(0.0, reach)
     panels[0, 0].set_ylim(min(lows), max(highs))
     for axes in panels.flat:
@@ -279,14 +273,12 @@ class SegmentView:
             axes.plot(self._r[chosen], self._z[chosen], 'o', label=label, **look)
         axes.set_ylabel('height z, sensor frame [m]')
 
-    def heights_shown(self, reach: float) -> tuple[float, float]:
-        """Limits around the candidates near the ground, as far as it rests on inliers [m]."""
-        if not (self._inlier & (self._r <= reach)).any():
-            low, high = np.quantile(self.z, (0.0, 0.5)) if len(self.z) else (-2.0, 0.0)
-            return float(low) - BELOW, float(high) + ABOVE
-        height = np.abs(self._z - np.interp(self._r, self._knots, self._mean))
-        near = self._z[(height <= NEAR_GROUND) & (self._r <= reach)]
-        return float(near.min()) - BELOW, float(near.max()) + ABOVE
+    def heights_shown(self) -> tuple[float, float]:
+        """Limits around the inliers, or if none the lower half of the points [m]."""
+        z = self._z[self._inlier]
+        if not len(z):
+            z = np.quantile(self.z, (0.0, 0.5)) if len(self.z) else np.array([-2.0, 0.0])
+        return float(z.min()) - BELOW, float(z.max()) + ABOVE
 
     def _draw_lines(self, axes: Any) -> None:
         """Draw each line over its extent, and the critical points where the next one begins."""
