@@ -75,17 +75,18 @@ def clusters(scores: Scores) -> DataFrame:
     return found.assign(cluster=np.searchsorted(ends, np.arange(n), side='right'))
 
 
-def difference_interval(
+def interval_text(
     scores: Scores,
     other: str,
     measure: Measure,
     frame: DataFrame | None = None,
     ours: str = '',
-) -> tuple[float, float] | None:
+) -> str | None:
     """Interval of a measure of ours, by default the first method, minus that of another.
 
-    It is of the pooled scans, or of the rows of another `frame` of the scores. None with fewer
-    than two clusters, or where a ratio is over nothing. It draws in the same way each time.
+    It is of the pooled scans, or of the rows of another `frame` of the scores, in percent or cm:
+    ``-0.10 to +0.25 tie``. None with fewer than two clusters, or where a ratio is over nothing.
+    It draws in the same way each time.
     """
     of_scan = clusters(scores)
     names = of_scan['cluster'].unique()
@@ -105,23 +106,8 @@ def difference_interval(
     if np.isnan(difference).any():
         return None
     tail = 0.5 * (1.0 - CONFIDENCE)
-    low, high = np.quantile(difference, [tail, 1.0 - tail]).tolist()
-    return low, high
-
-
-def interval_text(
-    scores: Scores,
-    other: str,
-    measure: Measure,
-    frame: DataFrame | None = None,
-    ours: str = '',
-) -> str | None:
-    """`difference_interval` in percent or cm, as in ``-0.10 to +0.25 tie``; None without one."""
-    found = difference_interval(scores, other, measure, frame, ours)
-    if found is None:
-        return None
-    low, high = found
-    return f'{100.0 * low:+.2f} to {100.0 * high:+.2f}' + ' tie' * (low <= 0.0 <= high)
+    low, high = np.quantile(100.0 * difference, [tail, 1.0 - tail])
+    return f'{low:+.2f} to {high:+.2f}{" tie" if low <= 0.0 <= high else ""}'
 
 
 def interval_note(scores: Scores) -> str:
