@@ -249,9 +249,11 @@ def test_tables_hold_the_sums_of_the_frames(tmp_path, capfd):
     assert document['environment']['versions']['pypatchworkpp']
     # State of learning is that of our method only.
     assert (frames['status'].notna() == (frames['method'] == OURS)).all()
+    assert 'objects' not in document  # there are none
     rings = {row['range']: row for row in document['rings']}
     assert rings['> 50 m']['iou'] is rings['> 50 m']['peer_iou'] is None
     assert rings['all']['iou'] == document['groundgrid'][-1]['iou']
+    assert ' to ' in rings['all']['interval']
     own, pooled = frames[frames['method'] == OURS], document['heights'][-1]
     assert own['n_points'].sum() == pooled['n_points']
     assert pooled['rmse'] ** 2 == pytest.approx(
