@@ -21,7 +21,7 @@ from gp_ground_seg.lab.scoring.evaluate import (
     score_methods,
 )
 from gp_ground_seg.lab.scoring.metrics import count_labels, height_sums, label_ratios
-from gp_ground_seg.lab.scoring.objects import CLASSES, count_objects
+from gp_ground_seg.lab.scoring.objects import CLASSES
 from gp_ground_seg.lab.scoring.peers import InterpolationMethod, ground_points
 from gp_ground_seg.lab.scoring.report import records
 from gp_ground_seg.lab.scoring.tables import time_tables
@@ -29,10 +29,6 @@ from gp_ground_seg.lab.simulation import Kind, semantic_kitti_labels
 from gp_ground_seg.lab.simulation.objects import object_heights
 
 FIXED = Config().replace(**{'learning.mode': 'fixed'})
-
-
-def iou_of(label, truth):
-    return label_ratios(count_labels(label, truth))['iou']
 
 
 @pytest.fixture(scope='module')
@@ -65,20 +61,14 @@ def test_pairs_are_differences_of_models_that_learn_alike():
     frames = simulated_frames(['vlp-16'], ['ramp', 'bank'], 1, (0.0,))
     tables = experiments.compare_models(frames, Config()).tables
     of_models = {row['method']: row for row in records(tables['models'].frame)}
-    pairs = records(tables['pairs'].frame)
-    three = ['Z - constant', 'Z-L - constant', 'Z-L - Z']
-    *alike, more, last = [(row['pair'], row['theta']) for row in pairs]
-    assert sorted(alike) == sorted(itertools.product(three, ['learned', 'not learned']))
-    assert (more, last) == (
-        ('Z-L - Z-L', 'all learned - learned'),
-        ('Z-L - interpolation', 'learned'),
-    )
-    for row in pairs[:-2]:
+    *alike, more, last = records(tables['pairs'].frame)
+    assert (more['pair'], more['theta']) == ('Z-L - Z-L', 'all learned - learned')
+    assert (last['pair'], last['theta']) == ('Z-L - interpolation', 'learned')
+    assert len(alike) == 6
+    for row in alike:
         ours, other = (of_models[f'{name}, {row["theta"]}'] for name in row['pair'].split(' - '))
         for name in ('iou', 'rmse'):
             assert row[f'{name}_difference'] == pytest.approx(ours[name] - other[name])
-            low, high = map(float, row[f'{name}_interval'].removesuffix(' tie').split(' to '))
-            assert low - 0.006 <= 100.0 * row[f'{name}_difference'] <= high + 0.006
 
 
 def test_steps_go_from_the_paper_to_the_parameters_given():
@@ -149,13 +139,12 @@ def test_interpolation_has_the_median_of_three_segments_and_our_labels(frames):
     expected = np.median(lines, axis=0)[far]
     np.testing.assert_allclose(surface.mean[segment][far], expected, atol=1e-9)
     assert result.fit.mode == 'fixed'
-    assert iou_of(result.label, scan.truth) > 0.9
+    assert label_ratios(count_labels(result.label, scan.truth))['iou'] > 0.9
 
 
 def test_scenes_without_a_free_lane_are_seen_from_the_origin_only():
     frames = simulated_frames(['vlp-16'], ['kerb', 'car_park'], 1, (0.0, 6.0))
-    places = [(frame.scene, frame.x) for frame in frames]
-    assert places == [('kerb', 0.0), ('kerb', 6.0), ('car_park', 0.0)]
+    assert [frame[1:] for frame in frames] == [('kerb', 0, 0), ('kerb', 0, 6), ('car_park', 0, 0)]
 
 
 @pytest.mark.parametrize('scene', ['hidden_climb', 'traffic_jam', 'low_boxes'])
@@ -173,56 +162,32 @@ def test_objects_of_a_simulated_scan_are_those_that_its_rays_hit(scene):
     np.testing.assert_array_equal(objects.object_id, made.object_id)
 
 
-def test_scenes_are_scored_by_ours_and_by_the_peer():
-    frames = simulated_frames(['vlp-16', 'hdl-64e-vehicle'], ['on_ramp'], 1, (0.0,))
-    report = experiments.score_scenes(frames, FIXED)
-    rows = records(report.tables['scenes'].frame)
-    for frame, row in zip(frames, rows, strict=True):
-        scan, peer = load_scan(frame), experiments.peer_of(frame.sensor)
-        ours = GroundSegmenter(FIXED).segment(scan.points)
-        peer.run(scan.points)
-        assert (row['sensor'], row['scene']) == frame[:2]
-        for who, result in (('', ours), ('peer_', peer.result())):
-            error = (result.ground_z - scan.ground_z)[scan.is_ground]
-            assert row[f'{who}iou'] == iou_of(result.label, scan.truth)
-            assert row[f'{who}rmse'] == pytest.approx(np.sqrt(np.nanmean(error**2)))
-            lost = count_objects(scan.points, result.label, scan.objects)
-            own = [one['n_lost'] for one in lost if one['class'] == 'vehicle']
-            assert row[f'{who}lost_vehicles'] == sum(own)
-    assert {one['method'] for one in report.rows} == {OURS, PATCHWORKPP}
-
-
-def scored_by_hand():
-    """Ours and a peer on three scenes: errors of the height, and objects of two bands."""
-
-    def rows(method, *ious, error, lost):
-        height = height_sums(np.zeros(4), np.array([error, error, -3.0 * error, np.nan]))
-        scans, objects = [], []
-        for scene, iou in zip(('vlp-16 flat', 'vlp-16 ramp', 'os1 ramp'), ious, strict=True):
-            key = {'method': method, 'sequence': scene, 'index': ''}
-            scans.append({
-                **key, **height, 'cluster': scene, 'n_scans': 1, 'n_objects': 6, 'n_lost': lost,
-                'tp': iou, 'fp': 100 - iou, 'fn': 0, 'tn': 0,
-            })  # fmt: skip
-            for name, band in (
-                ('vehicle', '0-10 m'), ('vehicle', '20-40 m'), ('vehicle', '> 40 m'),
-                ('person', '0-10 m'), ('cyclist', '0-10 m'), ('low, 0.3 m', '0-10 m'),
-            ):  # fmt: skip
-                counts = {'n_objects': 2, 'n_lost': lost}
-                objects.append({**key, 'class': name, 'range': band, **counts})
-        return {'scans': scans, 'objects': objects}
-
-    ours = rows(OURS, 90, 80, 70, error=0.1, lost=0)
-    return make_scores([ours, rows('x', 89, 81, 70, error=0.2, lost=1)])
-
-
-def values(row, *names):
-    return [row[f'{who}{name}'] for name in names for who in ('', 'peer_')]
+def scored_by_hand(method, *ious, error, lost):
+    """Rows of a method on three scenes: errors of the height, and objects of two bands."""
+    height = height_sums(np.zeros(4), np.array([error, error, -3.0 * error, np.nan]))
+    scans, objects = [], []
+    for scene, iou in zip(('vlp-16 flat', 'vlp-16 ramp', 'os1 ramp'), ious, strict=True):
+        key = {'method': method, 'sequence': scene, 'index': ''}
+        labels = {'tp': iou, 'fp': 100 - iou, 'fn': 0, 'tn': 0}
+        counts = {'n_scans': 1, 'n_objects': 6, 'n_lost': lost}
+        scans.append({**key, 'cluster': scene, **height, **labels, **counts})
+        for name, band in (
+            ('vehicle', '0-10 m'), ('vehicle', '20-40 m'), ('vehicle', '> 40 m'),
+            ('person', '0-10 m'), ('cyclist', '0-10 m'), ('low, 0.3 m', '0-10 m'),
+        ):  # fmt: skip
+            counts = {'n_objects': 2, 'n_lost': lost}
+            objects.append({**key, 'class': name, 'range': band, **counts})
+    return {'scans': scans, 'objects': objects}
 
 
 def test_scenes_by_hand():
     """Of each scan the counts are those of test_objects.py."""
-    scores = scored_by_hand()
+    ours = scored_by_hand(OURS, 90, 80, 70, error=0.1, lost=0)
+    scores = make_scores([ours, scored_by_hand('x', 89, 81, 70, error=0.2, lost=1)])
+
+    def values(row, *names):
+        return [row[f'{who}{name}'] for name in names for who in ('', 'peer_')]
+
     row = records(experiments._scene_table(scores).frame)[0]
     assert (row['sensor'], row['scene']) == ('vlp-16', 'flat')
     assert values(row, 'iou', 'lost_vehicles', 'lost_persons') == [0.9, 0.89, 0, 3, 0, 2]

@@ -2,8 +2,6 @@
 
 import json
 import math
-import os
-import platform
 import subprocess
 
 import numpy as np
@@ -52,12 +50,6 @@ def test_forms_of_a_table():
     ]
 
 
-def test_no_rows_have_no_titles():
-    table = Table('title', report.frame_of([], ['a']), {}, ['nothing'])
-    assert table.text() == 'title\nnothing'
-    assert report.records(table.frame) == []
-
-
 def test_json_files_have_null_for_what_is_undefined(tmp_path):
     rows = pd.DataFrame({'n': np.array([3]), 'x': [math.nan], 'is_so': [np.bool_(True)]})
     config = Config().replace(**{'label.ground_tolerance': 0.123})
@@ -74,14 +66,11 @@ def test_json_files_have_null_for_what_is_undefined(tmp_path):
 
 def test_the_environment_is_recorded():
     environment = report.describe_environment('no-such-package')
-    assert environment['versions']['gp_ground_seg'] == __version__
-    assert environment['versions']['no-such-package'] is None
-    assert environment['n_cores'] == len(os.sched_getaffinity(0))
-    assert environment['python'] == platform.python_version()
-    assert environment['cpu']
-    line = report.machine_line(
-        {**environment, 'n_cores': 1, 'commit': f'{"a" * 40}-dirty'}, 'numba'
-    )
+    assert environment['versions'].items() >= {
+        'gp_ground_seg': __version__, 'no-such-package': None
+    }.items()  # fmt: skip
+    environment |= {'n_cores': 1, 'commit': f'{"a" * 40}-dirty'}
+    line = report.machine_line(environment, 'numba')
     assert ', 1 thread on 1 core, numba; Python' in line and 'no-such-package absent' in line
     assert line.endswith(f'commit {"a" * 12} (changed since)')
     assert 'commit' not in report.machine_line({**environment, 'commit': None}, 'numpy')
