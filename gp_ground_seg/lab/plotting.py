@@ -22,12 +22,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.points import take_points
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.files import staged_file, writing
-from gp_ground_seg.lab.scoring.metrics import (
-    Labels,
-    check_lengths,
-    count_labels,
-    label_ratios,
-)
+from gp_ground_seg.lab.scoring.metrics import Labels, count_labels, label_ratios
 
 COLOURS = {
     'ground': '#B9BFC6',
@@ -86,7 +81,6 @@ def plot_scan_view(
     or SVG points are pixels.
     """
     xyz = take_points(points).astype(np.float64)
-    check_lengths(len(xyz), label=label, truth=truth)
     said, layers = label_layers(label, truth)
     figure, foot = new_figure(WIDTH, HEIGHT + FOOT), FOOT / (HEIGHT + FOOT)
     axes = figure.add_axes((0.0, foot, 1.0, 1.0 - foot))
@@ -183,7 +177,6 @@ def plot_segment(
     The file `path` is replaced.
     """
     z = result.pose.level(take_points(points).astype(np.float64))[:, 2].astype(np.float64)
-    check_lengths(len(z), result=result.label, truth=truth)
     views = [SegmentView(result, segment, z) for segment in segments]
     figure = new_figure(5.0 + 6.5 * len(views), 7.6)
     figure.set_layout_engine('constrained')

@@ -13,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import GroundSegmenter, Label
-from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.lab.scoring.objects import (
     BAND_EDGES,
     BAND_TITLES,
@@ -29,13 +28,6 @@ from gp_ground_seg.lab.scoring.objects import (
     labelled_objects,
     local_ground,
 )
-
-
-def test_objects_are_those_of_the_points():
-    ones = np.ones(10, dtype=int)
-    objects = Objects(ones, ones[:3], 0.0 * ones)
-    with pytest.raises(PointCloudError, match=r'object_id of shape \(3,\) for 10 points'):
-        count_objects(np.zeros((10, 3)), ones, objects)
 
 
 def counted_by_loops(points, label, objects):

@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.lab import plotting
 from gp_ground_seg.lab.plotting import (
     CAMERA,
@@ -121,17 +120,6 @@ def test_clouds_with_nothing_to_see(tmp_path, points):
         plot_segment(result, Config(), points, [SEGMENT], path, truth, title=r'$\none _ %')
         assert imread(path).ndim == 3
     assert [*tmp_path.iterdir()] == [path]
-
-
-def test_values_do_not_fit_the_points(tmp_path):
-    points, path, nine = patch(0, 0), tmp_path / 'a.png', np.zeros(9, np.uint8)
-    for name, label, truth in (('label', nine, None), ('truth', repeat(0), nine)):
-        with pytest.raises(PointCloudError, match=rf'{name} of shape \(9,\) for 4000'):
-            plot_scan_view(points, label, path, truth=truth)
-    result = GroundSegmenter().segment(ahead()[0])
-    with pytest.raises(PointCloudError, match=r'result of shape \(1500,\) for 4000 points'):
-        plot_segment(result, Config(), points, [0], path)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_camera_projects_as_a_camera_does():

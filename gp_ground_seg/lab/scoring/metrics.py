@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import IntArray, Label
 from gp_ground_seg.data.semantic_kitti import GROUND_CLASSES, OUTLIER, UNLABELLED, VEGETATION
 
@@ -118,15 +117,6 @@ def _counts(label: Labels, truth: Labels, group: IntArray, n_groups: int) -> Int
     code = 4 * group + 2 * (label != Label.GROUND) + (truth != Label.GROUND)
     # In the order of the codes: true and false positives, false and true negatives.
     return np.bincount(code[scored], minlength=4 * n_groups).reshape(n_groups, 4)
-
-
-def check_lengths(n_points: int, **values: Any) -> None:
-    """Raise `PointCloudError` for an array without one value per point; None is left out."""
-    for name, array in values.items():
-        if array is not None and array.shape != (n_points,):
-            raise PointCloudError(
-                f'{name} of shape {array.shape} for {n_points} points: must be ({n_points},)'
-            )
 
 
 def height_sums(

@@ -18,7 +18,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, Label
-from gp_ground_seg.lab.scoring.metrics import Labels, check_lengths, range_titles
+from gp_ground_seg.lab.scoring.metrics import Labels, range_titles
 
 MIN_HEIGHT = 0.3
 """Height above the local ground from which on a return on an object counts [m]."""
@@ -86,7 +86,6 @@ def count_objects(
     ground. A return counts in the band of its horizontal range, an object in that of the
     median of its returns that count. Classes without a return that counts are left out.
     """
-    check_lengths(len(points), **objects._asdict())
     x, y, z = points[:, :3].astype(np.float64).T
     reach = np.hypot(x, y)
     on = (objects.class_of >= 0) & np.isfinite(reach + z)
