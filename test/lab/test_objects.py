@@ -14,8 +14,6 @@ from hypothesis import strategies as st
 
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.lab.scoring.objects import (
-    BAND_EDGES,
-    BAND_TITLES,
     CLASSES,
     LOW_CLASSES,
     MIN_HEIGHT,
@@ -33,35 +31,26 @@ from gp_ground_seg.lab.scoring.objects import (
 def counted_by_loops(points, label, objects):
     """Count as the module says it does, one return after the other."""
     share, own = {}, {}
-    for k, (x, y, z) in enumerate(points):
-        kind, number = objects.class_of[k], objects.object_id[k]
-        reach, is_ground = math.hypot(x, y), label[k] == Label.GROUND
-        if math.isinf(reach):
+    for k, (x, _, z) in enumerate(points):
+        kind, number, is_ground = objects.class_of[k], objects.object_id[k], label[k] == 1
+        if math.isinf(x) or kind < 0:
             continue
-        if kind < 0 or not z - objects.ground_z[k] >= (0.1 if kind >= 3 else MIN_HEIGHT):
+        if not z - objects.ground_z[k] >= (0.1 if kind >= 3 else MIN_HEIGHT):
             continue
-        share.setdefault((kind, band_of(reach)), []).append(is_ground)
+        share.setdefault(kind, []).append(is_ground)
         if number:
-            own.setdefault((kind, number), []).append((reach, is_ground))
+            own.setdefault((kind, number), []).append(is_ground)
     found = {}
     for (kind, _), its in own.items():
         if len(its) >= (3 if kind >= 3 else MIN_RETURNS):
-            band = band_of(np.median([reach for reach, _ in its]))
-            is_lost = sum(is_ground for _, is_ground in its) > len(its) / 2
-            found.setdefault((kind, band), []).append(is_lost)
+            found.setdefault(kind, []).append(sum(its) > len(its) / 2)
     return [
-        {'class': name, 'range': title, **dict(zip(OBJECT_COUNTS, (
-            number for counted in (share, found)
-            for own in [counted.get((kind, band), [])] for number in (len(own), sum(own))
+        {'class': [*CLASSES][kind], **dict(zip(OBJECT_COUNTS, (
+            number for its in (share[kind], found.get(kind, []))
+            for number in (len(its), sum(its))
         ), strict=True))}
-        for kind, name in enumerate(CLASSES)
-        if any(k == kind for k, _ in share)
-        for band, title in enumerate(BAND_TITLES)
+        for kind in sorted(share)
     ]  # fmt: skip
-
-
-def band_of(reach):
-    return next(k for k, far in enumerate(BAND_EDGES[1:]) if reach < far)
 
 
 def drawn_scan(seed, n):
@@ -234,18 +223,14 @@ def test_tables_of_objects_low_things_and_false_cells_are_those_of_the_labels(tm
         return json.loads(target.read_text())
 
     document = evaluated('--peer', 'patchworkpp', '--cut', 1)
-    assert re.search(r'^vehicle +all +\d.* 2 +0 +\d', capsys.readouterr().out, re.MULTILINE)
+    assert re.search(r'^vehicle +\d.* 2 +0 +\d', capsys.readouterr().out, re.MULTILINE)
     is_ground, segment = entries == 40, GroundSegmenter().segment
     result = segment(points)
     rows = count_objects(points, result.label, labelled_objects(points, entries, is_ground))
-    total = {name: sum(row[name] for row in rows) for name in OBJECT_COUNTS}
-    expected = [*rows, {'class': 'vehicle', 'range': 'all', **total}]
-    for row, own in zip(document['objects'], expected, strict=True):
-        names = 'class', 'range', 'n_returns', 'n_objects'
-        assert [row[name] for name in names] == [own[name] for name in names]
-        share = own['n_ground'] / own['n_returns'] if own['n_returns'] else None
-        assert row['share_ground'] == share
-        assert row['n_lost'] == (own['n_lost'] if own['n_objects'] else None)
+    (row,), (own,) = document['objects'], rows
+    names = 'class', 'n_returns', 'n_objects', 'n_lost'
+    assert [row[name] for name in names] == [own[name] for name in names]
+    assert row['share_ground'] == own['n_ground'] / own['n_returns']
     assert (row['n_objects'], row['n_lost']) == (2, 0) and row['peer_share_ground'] is not None
 
     cut = cut_objects(points, entries & 0xFFFF == 10, is_ground, 1.0)

@@ -47,7 +47,7 @@ KEYS = ('method', 'sequence', 'index')
 COLUMNS: dict[str, tuple[str, ...]] = {
     'scans': KEYS,
     'rings': (*KEYS, 'range', *COUNTS),
-    'objects': (*KEYS, 'class', 'range', *OBJECT_COUNTS),
+    'objects': (*KEYS, 'class', *OBJECT_COUNTS),
 }
 """Columns that each frame has, even without rows."""
 
@@ -259,7 +259,7 @@ class Scores(NamedTuple):
     scans : sums of each scan: `COUNTS`, of `metrics.height_sums`, `OBJECT_COUNTS`, shares;
         seconds, those of the stages, pose, fit; what a method does not have is NaN
     rings : `COUNTS` of each ring of a scan
-    objects : `OBJECT_COUNTS` of each scan, by class and band
+    objects : `OBJECT_COUNTS` of each scan, by class
     """
 
     scans: DataFrame

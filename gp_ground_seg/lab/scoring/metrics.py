@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,17 +23,12 @@ COUNTS = ('tp', 'fp', 'fn', 'tn')
 """Points by true and given label, ground being positive."""
 
 
-def range_titles(edges: Sequence[float]) -> tuple[str, ...]:
-    """Names of the bands of range between edges [m], the last of which may be infinite."""
-    return tuple(
-        f'> {low:g} m' if math.isinf(high) else f'{low:g}-{high:g} m'
-        for low, high in itertools.pairwise(edges)
-    )
-
-
 RING_EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, math.inf)
 """Edges of the rings of horizontal range [m]; each holds its inner edge, not its outer one."""
-RING_TITLES = range_titles(RING_EDGES)
+RING_TITLES = (
+    *(f'{low:g}-{high:g} m' for low, high in itertools.pairwise(RING_EDGES[:-1])),
+    f'> {RING_EDGES[-2]:g} m',
+)
 
 
 def true_labels(semantic: npt.NDArray[np.integer]) -> Labels:

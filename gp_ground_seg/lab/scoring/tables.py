@@ -181,27 +181,27 @@ def evaluation(scores: Scores, config: Config) -> Report:
     if scores.has_truth:
         tables['groundgrid'] = _grouped(
             scores, 'GroundGrid convention: vegetation left out [%]',
-            scores.scans, ['sequence'], ['n_scans', *metrics.LABEL_MEASURES], ['iou'],
+            scores.scans, 'sequence', ['n_scans', *metrics.LABEL_MEASURES], ['iou'],
         )  # fmt: skip
         tables['low_things'] = _grouped(
-            scores, 'Low things and false cells [%]', scores.scans, ['sequence'],
+            scores, 'Low things and false cells [%]', scores.scans, 'sequence',
             [column for name in objects.SHARES for column in (f'{name}_n', name)],
             [*objects.SHARES],
         )  # fmt: skip
         tables['heights'] = _grouped(
             scores, 'Height of the ground under returns labelled ground [cm]; shares without a '
             'model and within one and two standard deviations [%]',
-            scores.scans, ['sequence'], ['n_points', *HEIGHTS], ['rmse'],
+            scores.scans, 'sequence', ['n_points', *HEIGHTS], ['rmse'],
         )  # fmt: skip
         minus = f' minus that of {scores.peer}' if scores.peer else ''
         tables['rings'] = _grouped(
             scores, f'IoU{minus} by horizontal range (GroundGrid convention) [%]',
-            scores.rings, ['range'], [*metrics.LABEL_MEASURES], ['iou'], 'iou',
+            scores.rings, 'range', [*metrics.LABEL_MEASURES], ['iou'], 'iou',
         )  # fmt: skip
     if len(scores.objects):
         tables['objects'] = _grouped(
             scores, 'Objects: returns on them, and the share called ground [%]; objects, and '
-            'those lost', scores.objects, ['class', 'range'],
+            'those lost', scores.objects, 'class',
             ['n_returns', 'share_ground', 'n_objects', 'n_lost'], ['share_ground', 'n_lost'],
             'share_ground',
         )  # fmt: skip
@@ -214,28 +214,27 @@ def _grouped(
     scores: Scores,
     title: str,
     frame: DataFrame,
-    by: list[str],
+    by: str,
     columns: list[str],
     compared: list[str],
     interval: str = '',
 ) -> Table:
-    """Lay out measures of the groups of a frame, and of all in the last column of `by`.
+    """Lay out measures of the groups of a frame, and of all but for classes of objects.
 
     The measure `interval` has one of the difference to the peer.
     """
-    rows = with_all(frame, by[-1])
-    found = measured(rows, *by)
+    rows = frame if by == 'class' else with_all(frame, by)
+    found = measured(rows, by)
     if 'n_lost' in found:
         found['n_lost'] = found['n_lost'].where(found['n_objects'] > 0)
     table = beside(found[[name for name in columns if name in found]], scores, *compared)
     table = table.reset_index()
-    if by[0] == 'class':
+    if by == 'class':
         order = [*objects.CLASSES].index
-        table = table.sort_values('class', key=lambda own: own.map(order), kind='stable')
+        table = table.sort_values('class', key=lambda own: own.map(order))
     title += peer_note(scores)
     if interval and scores.peer:
-        groups = [rows.merge(table.loc[[k], by]) for k in table.index]
-        measure = MEASURES[interval]
+        groups, measure = (rows[rows[by] == name] for name in table[by]), MEASURES[interval]
         table['interval'] = [interval_text(scores, scores.peer, measure, own) for own in groups]
         title += f'; {COMPARED[interval].removesuffix(" [%]")}: {interval_note(scores)}'
     return Table(title, table)
