@@ -177,29 +177,24 @@ def run_peer(scene, sensor='vlp-16', **options):
     return scan, method
 
 
-def test_the_peer_has_the_height_of_its_sensor():
-    """Its own is the published one, and a slope is where it matters."""
-    published = pypatchworkpp.Parameters().sensor_height
-    labels = [
-        run_peer('slope', sensor_height=height)[1].result().label.tolist()
-        for height in (None, published, 0.8)
-    ]
-    assert labels[0] == labels[1] != labels[2]
-
-
-def test_the_peer_is_told_where_the_sensor_is():
+def test_the_peer_has_the_place_and_the_height_of_the_sensor():
     """It takes the origin of a cloud to be the sensor, which that of a vehicle's frame is not."""
-    scan, own = run_peer('flat', 'hdl-64e', sensor_height=1.73)
-    expected, place = own.result(), np.array([1.35, -0.2, 1.73, 0.0], dtype=np.float32)
-    told = PatchworkppMethod.of_sensor(SensorConfig(0.0, 0.0, 0.0, *place[:3].tolist()))
-    told.run(moved := scan.points + place)
-    found = told.result()
+    scan, own = run_peer('slope', sensor_height=0.8)
+    expected, place = own.result(), np.array([1.35, -0.2, 0.8, 0.0], dtype=np.float32)
+    sensor = SensorConfig(0.0, 0.0, 0.0, *place[:3].tolist())
+
+    def alike(method, points):
+        method.run(points)
+        return np.mean(method.result().label == expected.label)
+
+    told, moved = PatchworkppMethod.of_sensor(sensor), scan.points + place
     # But for rounding to the single precision of the points.
-    assert np.mean(found.label == expected.label) > 0.999
-    assert np.median(np.abs(found.ground_z - 1.73 - expected.ground_z)) < 1e-3
-    untold = PatchworkppMethod(0.0)
-    untold.run(moved)
-    assert np.mean(untold.result().label == expected.label) < 0.8
+    assert alike(told, moved) > 0.997
+    assert np.median(np.abs(told.result().ground_z - 0.8 - expected.ground_z)) < 1e-3
+    assert alike(PatchworkppMethod(0.8), moved) < 0.8
+    # By default it has the published height; a slope is where that matters.
+    published = PatchworkppMethod(pypatchworkpp.Parameters().sensor_height)
+    assert alike(PatchworkppMethod(), scan.points) == alike(published, scan.points) < 0.995
 
 
 def test_the_surface_of_the_peer_is_that_of_its_planes():

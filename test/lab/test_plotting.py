@@ -242,18 +242,14 @@ def test_what_is_drawn_is_the_result():
         ends = np.interp(line.get_xdata()[[0, -1]], r, z)
         np.testing.assert_allclose(line.get_ydata()[[0, -1]], ends, atol=0.15)
 
-    length_scale, pseudo, *_ = below.lines
-    np.testing.assert_array_equal(
-        length_scale.get_ydata(), np.exp(result.log_length_scale[SEGMENT])
-    )
-    first, last = result.pseudo.offsets[SEGMENT : SEGMENT + 2]
-    np.testing.assert_array_equal(pseudo.get_xdata(), result.pseudo.r_bar[first:last])
-    values = np.exp(result.pseudo.log_extent[first:last])
-    values *= result.fit.theta['length_scale_factor']  # one for all
-    np.testing.assert_allclose(pseudo.get_ydata(), values)
+    length_scale, pseudo, *_ = (line.get_data() for line in below.lines)
+    np.testing.assert_array_equal(length_scale[1], np.exp(result.log_length_scale[SEGMENT]))
+    own = slice(*result.pseudo.offsets[SEGMENT : SEGMENT + 2])
+    np.testing.assert_array_equal(pseudo[0], result.pseudo.r_bar[own])
+    values = np.exp(result.pseudo.log_extent[own])
+    np.testing.assert_allclose(pseudo[1], values * result.fit.theta['length_scale_factor'])
     # The curve follows the pseudo-inputs: it stays among them and near each.
-    at_pseudo = np.interp(pseudo.get_xdata(), length_scale.get_xdata(), length_scale.get_ydata())
-    off = np.abs(np.log(at_pseudo / values))
+    off = np.abs(np.log(np.interp(pseudo[0], *length_scale) / pseudo[1]))
     assert off.mean() < 0.5 and off.max() < 1.0
 
 
