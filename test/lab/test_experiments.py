@@ -34,17 +34,6 @@ def frames(tmp_path_factory):
     return labelled_frames(write_streets(tmp_path_factory.mktemp('kitti'), s00=2, s08=1))
 
 
-def test_models_are_what_their_names_say():
-    models = {'constant': 'constant', 'Z': 'line_gradient', 'Z-L': 'latent'}
-    configs = {name: Config().replace(**changes) for name, changes in MODELS.items()}
-    for title, config in configs.items():
-        assert config.length_scale.model == models[title.split(',')[0]]
-        assert (config.learning.mode == 'fixed') == ('not learned' in title)
-    assert configs['Z-L, learned'] == Config()
-    # The last one is the paper's method.
-    assert [*configs.values()][-1] == Config().replace(**{'learning.fixed': 'none'})
-
-
 def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     """The worth of the latent process; docs/experiments.md has the whole table."""
     names = ('constant, learned', 'Z, learned', 'Z-L, all learned')
@@ -98,19 +87,6 @@ def test_ratios_of_times_pair_each_frame_with_the_peer():
     expected = {'grid': 0.025, 'label': 0.05, 'rest': 0.025}
     assert stage == {'method': 'learning', **{k: pytest.approx(v) for k, v in expected.items()}}
     assert 'ratio' not in time_tables(scores)['times'].frame
-
-
-def test_speed_runs_every_method_on_every_frame_in_each_pass(frames):
-    """In which order, and what is forgotten between sequences, test_evaluate.py says."""
-    numpy = Config().replace(**{'runtime.backend': 'numpy', 'grid.n_segments': 8})
-    rows = experiments.measure_speed(frames, numpy).rows
-    expected = ['learning', 'theta fixed', 'Patchwork++']
-    assert [*dict.fromkeys(row['method'] for row in rows)] == expected
-    wanted = [(frame.sequence, frame.index) for frame in frames] * experiments.N_PASSES
-    for name, mode in zip(expected, ('every_frame', 'fixed', None), strict=True):
-        own = [row for row in rows if row['method'] == name]
-        assert [(row['sequence'], row['index']) for row in own] == wanted
-        assert all(row['seconds'] > 0.0 and row['mode'] == mode for row in own)
 
 
 def test_interpolation_joins_lowest_points_that_are_not_too_steep():

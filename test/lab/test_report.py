@@ -24,7 +24,6 @@ TABLE = Table(
         'name': Form('sequence'), 'points': Form('points', ',.0f'),
         'iou': Form('IoU [%]', '.2f', 100.0), 'change': Form('change', '+.1f', 100.0),
     },
-    ['a note'],
 )  # fmt: skip
 CELLS = [
     ['sequence', 'points', 'IoU [%]', 'peer IoU [%]', 'change'],
@@ -35,11 +34,11 @@ CELLS = [
 
 
 def test_forms_of_a_table():
-    title, *lines, note = TABLE.text().splitlines()
-    assert (title, note) == ('Scores', 'a note')
+    title, *lines = TABLE.text().splitlines()
+    assert title == 'Scores'
     assert [line.split() for line in lines] == [' '.join(row).split() for row in CELLS]
     assert len({*map(len, lines)}) == 1
-    title, table, note = TABLE.text(markdown=True).split('\n\n')
+    title, table = TABLE.text(markdown=True).split('\n\n')
     titles, rule, *rows = (line.split('|')[1:-1] for line in table.splitlines())
     assert [[cell.strip() for cell in row] for row in (titles, *rows)] == CELLS
     assert [mark[-1] == ':' for mark in rule] == [False, True, True, True, True]

@@ -256,8 +256,8 @@ def difference_table(scores: Scores) -> Table:
         for name, (given, peer) in found.items()
     ]
     forms = {'given': Form('given', *SHARE), 'peer': Form(other, *SHARE)}
-    title = f'Given minus {other}; {interval_note(scores)}'
-    return Table(title, frame_of(rows), forms, [_changed_note(scores.scans, other)])
+    title = f'Given minus {other}; {_changed_note(scores.scans, other)}; {interval_note(scores)}'
+    return Table(title, frame_of(rows), forms)
 
 
 def _changed_note(scans: DataFrame, other: str) -> str:
