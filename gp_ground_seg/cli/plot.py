@@ -5,21 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import numpy as np
-
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
-from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.semantic_kitti import read_labels
-from gp_ground_seg.lab.plotting import (
-    CAMERA,
-    Place,
-    camera_at,
-    plot_scan_view,
-    plot_segment,
-)
+from gp_ground_seg.lab.plotting import CAMERA, Place, camera_at, plot_scan_view, plot_segment
 from gp_ground_seg.lab.scoring.metrics import true_labels
 
 SCAN = """\
@@ -96,8 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.picture == 'scan':
         said = plot_scan_view(points, result.label, path, title, arguments.camera, truth=truth)
     else:
-        plot_segment(result, config, points, arguments.segment, path, truth, title)
-        said = '; '.join(_segment_counts(result, segment) for segment in arguments.segment)
+        said = plot_segment(result, config, points, arguments.segment, path, truth, title)
     print(f'{said}, written to {shown(path)}')
     options.note_spared(config, used)
     return 0
@@ -114,13 +104,3 @@ def camera(text: str) -> Place:
     if not (abs(azimuth) <= 360.0 and abs(elevation) <= 89.0 and 1.0 <= distance <= 1000.0):
         raise ValueError
     return camera_at(azimuth, elevation, distance)
-
-
-def _segment_counts(result: Segmentation, segment: int) -> str:
-    first, last = result.candidates.offsets[segment : segment + 2].tolist()
-    n_inliers = int(result.surface.inlier[first:last].sum())
-    n_pseudo = int(np.diff(result.pseudo.offsets)[segment])
-    return (
-        f'segment {segment}: {last - first} candidates, {n_inliers} inliers, '
-        f'{n_pseudo} pseudo-inputs'
-    )

@@ -169,12 +169,12 @@ def plot_segment(
     path: str | Path,
     truth: Labels | None = None,
     title: str = '',
-) -> None:
+) -> str:
     """Draw segments from the side, side by side; below each the length-scale and pseudo-inputs.
 
     `result` is the segmentation of `points`, (N, >=3) [m], under `config`. `truth` (N,) are true
     labels, UNKNOWN where a point does not count. The axes end a little beyond the last candidate.
-    The file `path` is replaced.
+    The file `path` is replaced. Return numbers of what is in them.
     """
     z = result.pose.level(take_points(points).astype(np.float64))[:, 2].astype(np.float64)
     views = [SegmentView(result, segment, z) for segment in segments]
@@ -200,6 +200,7 @@ def plot_segment(
     for axes in panels[:, -1]:
         axes.legend(loc='upper left', bbox_to_anchor=(1.01, 1.01), frameon=False)
     save(figure, path)
+    return '; '.join(view.counts for view in views)
 
 
 class SegmentView:
@@ -232,6 +233,15 @@ class SegmentView:
         first, last = (width * (self._segment + k) - 180.0 for k in (0, 1))
         model = '' if np.isfinite(self._mean).any() else ': no ground model'
         return f'segment {self._segment}, azimuth {first:g}° to {last:g}°{model}'
+
+    @property
+    def counts(self) -> str:
+        """Numbers of candidates, inliers and pseudo-inputs."""
+        n_pseudo = np.diff(self._result.pseudo.offsets)[self._segment]
+        return (
+            f'segment {self._segment}: {len(self._r)} candidates, {self._inlier.sum()} inliers, '
+            f'{n_pseudo} pseudo-inputs'
+        )
 
     def _relief(self, r: FloatArray) -> FloatArray:
         """Height of the relief at ranges (K,) in the middle of the segment, (K,) [m]."""

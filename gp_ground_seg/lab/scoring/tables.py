@@ -23,7 +23,6 @@ from gp_ground_seg.lab.scoring.report import (
     Form,
     Report,
     Table,
-    frame_of,
     records,
 )
 
@@ -245,19 +244,13 @@ def difference_table(scores: Scores) -> Table:
     other = scores.peer
     found = measured(scores.scans).loc[[scores.methods[0], other]]
     found = found[[name for name in COMPARED if name in found]].dropna(axis='columns', how='all')
-    rows = [
-        {
-            'measure': COMPARED[name],
-            'given': given,
-            'peer': peer,
-            'difference': given - peer,
-            'interval': interval_text(scores, other, MEASURES[name]),
-        }
-        for name, (given, peer) in found.items()
-    ]
+    table = found.T.set_axis(['given', 'peer'], axis='columns')
+    table['difference'] = table['given'] - table['peer']
+    table['interval'] = [interval_text(scores, other, MEASURES[name]) for name in table.index]
+    table = table.rename(index=COMPARED).reset_index(names='measure')
     forms = {'given': Form('given', *SHARE), 'peer': Form(other, *SHARE)}
     title = f'Given minus {other}; {_changed_note(scores.scans, other)}; {interval_note(scores)}'
-    return Table(title, frame_of(rows), forms)
+    return Table(title, table, forms)
 
 
 def _changed_note(scans: DataFrame, other: str) -> str:
