@@ -314,12 +314,6 @@ COUNTED = {'vehicles': ('vehicle',), 'persons': ('person', 'cyclist')}
 """Columns of objects, and their `CLASSES`."""
 
 
-def peer_of(sensor: str) -> PatchworkppMethod:
-    """Return Patchwork++ with the place and the height of a simulated sensor."""
-    model = SENSORS[sensor]
-    return PatchworkppMethod(model.height, model.origin or (0.0, 0.0, 0.0))
-
-
 def score_scenes(
     frames: Sequence[SimulatedFrame], config: Config, runner: Runner = HERE
 ) -> Report:
@@ -332,7 +326,9 @@ def score_scenes(
     """
     parts = []
     for sensor, group in itertools.groupby(frames, attrgetter('sensor')):
-        methods: list[Method] = [OurMethod(config), peer_of(sensor)]
+        model = SENSORS[sensor]
+        peer = PatchworkppMethod(model.height, model.origin or (0.0, 0.0, 0.0))
+        methods: list[Method] = [OurMethod(config), peer]
         parts.append(score_methods([*group], methods, load_scan, each_alone=True, runner=runner))
     scores = Scores.joined(parts)
     tables = {'scenes': _scene_table(scores)}
@@ -357,8 +353,7 @@ def _scene_table(scores: Scores) -> Table:
         own = own.reindex(found.index, fill_value=0)
         found = found.assign(**{kind: own['n_objects'], f'lost_{kind}': own['n_lost']})
         forms |= {kind: Form(kind, *COUNT), f'lost_{kind}': Form('lost', *COUNT)}
-    lost = [name for name in found if name.startswith('lost_')]
-    table = beside(found, scores, 'iou', 'rmse', *lost).drop(columns='difference')
+    table = beside(found, scores).drop(columns='difference')
     title = (
         'IoU of the ground against exact labels [%]; RMSE of the surface [cm]; vehicles, persons '
         'and cyclists, and those lost'
@@ -377,7 +372,7 @@ def _low_table(scores: Scores) -> Table:
     title = 'Low things by height, in plain view 3 to 20 m away, and the share that is lost [%]'
     forms = {name: Form(name.removeprefix('low, '), '.0f', 100.0) for name in LOW_CLASSES}
     forms['things'] = Form('things', *COUNT)
-    return Table(title + peer_note(scores), _placed(beside(found, scores, *LOW_CLASSES)), forms)
+    return Table(title + peer_note(scores), _placed(beside(found, scores)), forms)
 
 
 def _rough_table(scores: Scores) -> Table:
@@ -386,7 +381,7 @@ def _rough_table(scores: Scores) -> Table:
     found['scene'] = found['sequence'].str.split().str[1]
     how = {'n_scans': 'sum', 'n_objects': 'sum', 'iou': 'mean', 'rmse': 'mean', 'n_lost': 'sum'}
     found = found.groupby(['method', 'scene'], sort=False).agg(how)
-    table = beside(found, scores, 'iou', 'rmse', 'n_lost')
+    table = beside(found, scores)
     means = table.mean()
     means.update(table.filter(like='n_').sum())
     table.loc[ALL] = means

@@ -48,6 +48,11 @@ MEASURES: dict[str, Measure] = {
 IOU = MEASURES['iou']
 HEIGHTS = 'without_model', 'bias', 'rmse', 'median_absolute', 'within_1', 'within_2'
 """Measures of the heights that are shown."""
+PEERS = (
+    'iou', 'rmse', 'share_ground', 'n_lost', 'lost_vehicles', 'lost_persons', *objects.SHARES,
+    *objects.LOW_CLASSES,
+)  # fmt: skip
+"""Columns that tables have of the peer too."""
 COMPARED = {
     'iou': 'IoU [%]',
     'precision': 'precision [%]',
@@ -121,21 +126,20 @@ def interval_note(scores: Scores) -> str:
     return f'95 % interval: bootstrap over {n} {kind}{few}; tie: it holds 0'
 
 
-def beside(found: DataFrame, scores: Scores, *compared: str) -> DataFrame:
-    """Return the rows of ours, with each column `compared` of the peer after that of ours.
+def beside(found: DataFrame, scores: Scores) -> DataFrame:
+    """Return the rows of ours, with the columns of `PEERS` of the peer after those of ours.
 
-    `found` has the methods in the first level of its index. If ``iou`` is compared, the last
-    column is the difference. Without a peer there is nothing to compare.
+    `found` has the methods in the first level of its index. With ``iou`` the last column is the
+    difference. Without a peer there is nothing to compare.
     """
     ours = found.loc[scores.methods[0]]
     if not scores.peer:
         return ours
-    peer = found.loc[scores.peer, [name for name in compared if name in found]].add_prefix(PEER)
-    both = ours.join(peer)
+    both = ours.join(found.loc[scores.peer, found.columns.intersection(PEERS)].add_prefix(PEER))
     both = both[[
         column for name in ours for column in (name, f'{PEER}{name}') if column in both
     ]]  # fmt: skip
-    return both.assign(difference=both['iou'] - both['peer_iou']) if 'iou' in compared else both
+    return both.assign(difference=both['iou'] - both['peer_iou']) if 'iou' in both else both
 
 
 def with_measures(sums: DataFrame) -> DataFrame:
@@ -180,29 +184,27 @@ def evaluation(scores: Scores, config: Config) -> Report:
     if scores.has_truth:
         tables['groundgrid'] = _grouped(
             scores, 'GroundGrid convention: vegetation left out [%]',
-            scores.scans, 'sequence', ['n_scans', *metrics.LABEL_MEASURES], ['iou'],
+            scores.scans, 'sequence', ['n_scans', *metrics.LABEL_MEASURES],
         )  # fmt: skip
         tables['low_things'] = _grouped(
             scores, 'Low things and false cells [%]', scores.scans, 'sequence',
             [column for name in objects.SHARES for column in (f'{name}_n', name)],
-            [*objects.SHARES],
         )  # fmt: skip
         tables['heights'] = _grouped(
             scores, 'Height of the ground under returns labelled ground [cm]; shares without a '
             'model and within one and two standard deviations [%]',
-            scores.scans, 'sequence', ['n_points', *HEIGHTS], ['rmse'],
+            scores.scans, 'sequence', ['n_points', *HEIGHTS],
         )  # fmt: skip
         minus = f' minus that of {scores.peer}' if scores.peer else ''
         tables['rings'] = _grouped(
             scores, f'IoU{minus} by horizontal range (GroundGrid convention) [%]',
-            scores.rings, 'range', [*metrics.LABEL_MEASURES], ['iou'], 'iou',
+            scores.rings, 'range', [*metrics.LABEL_MEASURES], 'iou',
         )  # fmt: skip
     if len(scores.objects):
         tables['objects'] = _grouped(
             scores, 'Objects: returns on them, and the share called ground [%]; objects, and '
             'those lost', scores.objects, 'class',
-            ['n_returns', 'share_ground', 'n_objects', 'n_lost'], ['share_ground', 'n_lost'],
-            'share_ground',
+            ['n_returns', 'share_ground', 'n_objects', 'n_lost'], 'share_ground',
         )  # fmt: skip
     if scores.peer:
         tables['measures'] = difference_table(scores)
@@ -215,7 +217,6 @@ def _grouped(
     frame: DataFrame,
     by: str,
     columns: list[str],
-    compared: list[str],
     interval: str = '',
 ) -> Table:
     """Lay out measures of the groups of a frame, and of all but for classes of objects.
@@ -226,8 +227,7 @@ def _grouped(
     found = measured(rows, by)
     if 'n_lost' in found:
         found['n_lost'] = found['n_lost'].where(found['n_objects'] > 0)
-    table = beside(found[[name for name in columns if name in found]], scores, *compared)
-    table = table.reset_index()
+    table = beside(found[[name for name in columns if name in found]], scores).reset_index()
     if by == 'class':
         order = [*objects.CLASSES].index
         table = table.sort_values('class', key=lambda own: own.map(order))
