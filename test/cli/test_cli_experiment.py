@@ -48,6 +48,12 @@ def test_tables_and_the_rows_below_them(case, root, tmp_path, capsys, monkeypatc
     lengths, n_rows = CASES[case]
     rows = tables.pop('rows')
     assert len(rows) == n_rows
+    if words[0] in ('ablation', 'speed'):
+        fixed = 'not learned', 'theta fixed', 'interpolation'
+        for row in rows:
+            mode = 'fixed' if any(word in row['method'] for word in fixed) else 'every_frame'
+            assert row['mode'] == (None if row['method'] == 'Patchwork++' else mode)
+            assert 'numpy' not in row['method'] or row['backend'] == 'numpy'
     if words[0] == 'scenes':
         found = [(row['sequence'], row['index']) for row in rows]
         assert found == 2 * [(f'vlp-16 {name}', '0/0') for name in ('low_boxes', 'bank', 'ramp')]
