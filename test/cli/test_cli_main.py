@@ -49,7 +49,7 @@ def test_a_misspelt_command_is_one_line(word, hint, capsys):
         ('config dmp', "config: WHAT: invalid choice: 'dmp' (choose from {}"),
         ('plot a.pcd -o b', "plot: PICTURE: invalid choice: 'a.pcd' (choose from {}"),
         ('plot segment A -o B --segment 1,',
-         "plot segment: --segment: '1,': must be whole numbers, as in 157,158; {}"),
+         "plot segment: --segment: invalid numbers value: '1,'; {}"),
         ('experiment scenes --scenes flt', "experiment scenes: --scenes: 'flt': must be some of {}"
          ', each once; did you mean flat?; {}'),
         ('segment', 'segment: the following arguments are required: INPUT; {}'),
