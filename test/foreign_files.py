@@ -14,8 +14,7 @@ import lzf
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
-from gp_ground_seg.data.bag_files import POINT_CLOUD2
-from gp_ground_seg.data.bags import BagWriter, cloud_from_columns, encode_cloud
+from gp_ground_seg.data.bags import POINT_CLOUD2, BagWriter, cloud_from_columns, encode_cloud
 
 XYZ = np.arange(12, dtype='f4').reshape(4, 3)
 RAW = XYZ.tobytes()

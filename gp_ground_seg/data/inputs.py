@@ -12,8 +12,7 @@ from pathlib import Path
 
 from gp_ground_seg.core.errors import LOGGER, DataError, shown
 from gp_ground_seg.core.pipeline.points import take_points
-from gp_ground_seg.data.bag_files import BAG_SUFFIXES, METADATA_FILE
-from gp_ground_seg.data.bags import BagReader, decode_cloud
+from gp_ground_seg.data.bags import BAG_SUFFIXES, METADATA_FILE, BagReader, decode_cloud
 from gp_ground_seg.data.cloud_files import (
     FROM_TEXT,
     KITTI_COLUMNS,

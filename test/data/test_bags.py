@@ -10,8 +10,16 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosReliability
 
 from gp_ground_seg.core.errors import DataError, MissingDependencyError
-from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag_folder, resolve_storage
-from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud, jazzy_types
+from gp_ground_seg.data.bags import (
+    POINT_CLOUD2,
+    BagReader,
+    BagWriter,
+    decode_cloud,
+    encode_cloud,
+    is_bag_folder,
+    jazzy_types,
+    resolve_storage,
+)
 from gp_ground_seg.data.inputs import holds_bag
 
 SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive.db3', None)]
