@@ -23,10 +23,7 @@ COLUMNS = ('x', 'y', 'z', 'intensity')
 MAX_NUMBERS = 1000
 """Most numbers of a point: the header of a file without points can name any number."""
 _MAX_HEADER_BYTES = 1 << 16
-_COORDINATES = frozenset('xyzXYZ')
 _LONG = {'i8', 'u8'}
-_NO_NUMBER = re.compile(rb'[-+]?(nan\(\w+\)|1\.#(QNAN|SNAN|IND)\w*)', re.IGNORECASE)
-"""NaN as programs on Windows write it."""
 
 
 @dataclass(frozen=True)
@@ -194,8 +191,8 @@ def read_table(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
 def read_lines(text: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
     """Read points of a text, one a line; PointCloudError if there are fewer than it should have.
 
-    Further words of a line are left out. An integer field that has other numbers becomes float64.
-    A field beside x, y and z that has no numbers is left out.
+    Further words of a line are left out. What is no number is NaN, and an integer field that has
+    other numbers becomes float64.
     """
     lines = [line for line in text.splitlines() if line.strip()][:n_points]
     if len(lines) < n_points:
@@ -206,25 +203,17 @@ def read_lines(text: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
         return np.empty(0, dtype)
     with suppress(ValueError, TypeError):
         return np.loadtxt(lines, dtype, comments=None, ndmin=1, usecols=range(wanted))
-    lines = [_NO_NUMBER.sub(b'nan', line) for line in lines]
     if (n_words := min(len(line.split()) for line in lines)) < wanted:
         raise PointCloudError(
             f'a line of {n_words} words, its header says {wanted}, separated by spaces'
         )
+    table = np.genfromtxt(lines, comments=None, usecols=range(wanted), encoding='latin-1')
     columns: Columns = {}
-    stop = 0
     for name in dtype.names or ():
         own, shape = dtype[name].base, dtype[name].shape
-        start, stop = stop, stop + math.prod(shape)
-        for kind in (own, np.dtype('f8')):
-            with suppress(ValueError, TypeError):
-                values = np.loadtxt(lines, kind, None, usecols=range(start, stop), ndmin=2)
-                columns[name] = values.reshape(-1, *shape)
-                break
-        if name not in columns:
-            if name in _COORDINATES:
-                raise PointCloudError(f'field {name}: has what is no number')
-            note(f'field {name}: has what is no number; left out')
-        elif columns[name].dtype != own:
+        values, table = np.split(table.reshape(n_points, -1), [math.prod(shape)], axis=1)
+        columns[name] = values.astype(own).reshape(-1, *shape)
+        if own.kind != 'f' and (columns[name].reshape(values.shape) != values).any():
             note(f'field {name}: has numbers that are no {own}; read as float64')
+            columns[name] = values.reshape(-1, *shape)
     return gather(columns)
