@@ -207,7 +207,7 @@ def read_lines(text: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
         raise PointCloudError(
             f'a line of {n_words} words, its header says {wanted}, separated by spaces'
         )
-    table = np.genfromtxt(lines, comments=None, usecols=range(wanted), encoding='latin-1')
+    table = np.genfromtxt(lines, comments='\n', usecols=range(wanted), encoding='latin-1')
     columns: Columns = {}
     for name in dtype.names or ():
         own, shape = dtype[name].base, dtype[name].shape
