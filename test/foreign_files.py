@@ -64,7 +64,7 @@ NESTED = npy(np.zeros(4, [('p', [('x', 'f4'), ('y', 'f4')])]))
 CASES |= {
     'missing.npy': (None, 'no such file or folder'),
     'notes.docx': (b'hello', r'not a scan or bag; accepted are \.bin, \.pcd'),
-    'points.xyz': (b'1 2 3', 'a text of points: load it by numpy.loadtxt'),
+    'points.xyz': (b'1 2 3', 'of a text, save x, y, z as .npy'),
     'odd.bin': (bytes(17), '17 bytes is not a whole number of points of 4 float32'),
     'objects.npy': (npy(np.array([{}, 1]), allow_pickle=True), 'Object arrays cannot be'),
     'shape.npy': (npy_header((9999999999, 3)), r'cannot be read as \.npy \('),

@@ -128,9 +128,6 @@ FORMATS = (LABELS, *(suffix[1:] for suffix in WRITABLE))
 # Unlabelled, road and other-object.
 SEMANTIC_KITTI_CODE = {Label.UNKNOWN: 0, Label.GROUND: 40, Label.OBSTACLE: 99}
 _VALUES = ('height', 'ground_z', 'ground_std', 'p_ground')
-TEXT_SUFFIXES = ('.xyz', '.txt', '.csv')
-"""Files of text, whose columns nobody knows but their author."""
-FROM_TEXT = 'a text of points: load it by numpy.loadtxt or pandas.read_csv, save x y z as .npy'
 
 
 def read_file(path: Path, columns: int = KITTI_COLUMNS) -> Cloud:

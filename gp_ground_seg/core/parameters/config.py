@@ -322,24 +322,26 @@ class Config(ParameterGroups):
             low, high = float(self[lower]), float(self[upper])
             if not low < high:
                 raise ConfigError(f'{lower} = {low:g}: must be below {upper} = {high:g}')
-        _check_bins(self.grid)
-        _check_memory(self)
+        grid, size = self.grid, size_of_tables(self)
+        # Bins widen with range: the first one is the narrowest.
+        width = (grid.r_max - grid.r_min) / float(grid.n_bins) ** grid.bin_growth
+        if width < NARROWEST_BIN:
+            raise ConfigError(
+                f'grid.n_bins = {grid.n_bins}, grid.bin_growth = {grid.bin_growth:g} between '
+                f'grid.r_min = {grid.r_min:g} and grid.r_max = {grid.r_max:g}: the first bin '
+                f'would be {width:.2g} m wide; must be at least {NARROWEST_BIN:g} m'
+            )
+        if size > MAX_TABLES:
+            raise ConfigError(
+                f'grid.r_max = {grid.r_max:g}, faces.cell_size = {self.faces.cell_size:g}: '
+                f'tables of tiles and cells would take {size / 1e9:.1f} GB; must be at most '
+                f'{MAX_TABLES / 1e9:g} GB'
+            )
 
     @classmethod
     def preset(cls, name: str) -> Config:
         """Return the preset `name`, ``default`` or ``paper``; ConfigError for another."""
         return find_preset(name).config
-
-
-def _check_bins(grid: GridConfig) -> None:
-    # Bins widen with range: the first one is the narrowest.
-    width = (grid.r_max - grid.r_min) / float(grid.n_bins) ** grid.bin_growth
-    if width < NARROWEST_BIN:
-        raise ConfigError(
-            f'grid.n_bins = {grid.n_bins}, grid.bin_growth = {grid.bin_growth:g} between '
-            f'grid.r_min = {grid.r_min:g} and grid.r_max = {grid.r_max:g}: the first bin would be '
-            f'{width:.2g} m wide; must be at least {NARROWEST_BIN:g} m'
-        )
 
 
 def size_of_tables(config: Config) -> int:
@@ -348,16 +350,6 @@ def size_of_tables(config: Config) -> int:
     n_cells = config.grid.n_segments * config.grid.n_bins
     # Held against both backends by test_robustness.py.
     return 9 * n_tiles + 184 * n_cells
-
-
-def _check_memory(config: Config) -> None:
-    size = size_of_tables(config)
-    if size > MAX_TABLES:
-        raise ConfigError(
-            f'grid.r_max = {config.grid.r_max:g}, faces.cell_size = {config.faces.cell_size:g}: '
-            f'tables of tiles and cells would take {size / 1e9:.1f} GB; must be at most '
-            f'{MAX_TABLES / 1e9:g} GB'
-        )
 
 
 def parameter_specs() -> tuple[ParameterSpec, ...]:
