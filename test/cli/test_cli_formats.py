@@ -89,7 +89,7 @@ FOLDERS = {
     ),
     'SemanticKITTI': (['velodyne/000007.bin', 'labels/000007.label'], ['000007']),
     'nuScenes': (['samples/LIDAR_TOP/a__LIDAR_TOP__1.pcd.bin'], ['a__LIDAR_TOP__1']),
-    'sequences': (['sequences/00/velodyne/0.bin'], r'no \.bin, .* file in it, and not a rosbag2 fo'),
+    'sequences': (['sequences/00/velodyne/0.bin'], r'no \.bin, .* file in it, and not a rosbag2'),
 }
 
 

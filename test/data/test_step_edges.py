@@ -238,20 +238,19 @@ def test_what_stands_in_the_line_of_sight_hides_the_lower_ground(r, slope, is_hi
 
 
 def test_order_and_strange_points_do_not_matter():
-    xyz, is_ground, stands = level_scan(range(50, 70))
-    expected = find_edges(xyz, is_ground, stands, MAX_STEP_DOWN)
+    xyz, *masks = level_scan(range(50, 70))
+    expected = find_edges(xyz, *masks, MAX_STEP_DOWN).r
     order = np.random.default_rng(0).permutation(len(xyz))
-    found = find_edges(xyz[order], is_ground[order], stands[order], MAX_STEP_DOWN)
-    np.testing.assert_array_equal(found.r, expected.r)
+    np.testing.assert_array_equal(
+        find_edges(xyz[order], *(mask[order] for mask in masks), MAX_STEP_DOWN).r, expected
+    )
     strange = np.array([[np.nan] * 3, [np.inf, 0, -1], [1, 1, -np.inf], [0, 0, 0], [1e38] * 3])
-    more = np.concatenate([xyz, strange])
     for value in (False, True):
-        masks = (np.append(mask, np.full(5, value)) for mask in (is_ground, stands))
-        np.testing.assert_array_equal(find_edges(more, *masks, MAX_STEP_DOWN).r, expected.r)
+        more = (np.append(mask, np.full(5, value)) for mask in masks)
+        found = find_edges(np.concatenate([xyz, strange]), *more, MAX_STEP_DOWN).r
+        np.testing.assert_array_equal(found, expected)
     for n in (0, 1, 2, 3):
-        found = find_edges(xyz[:n], is_ground[:n], stands[:n], MAX_STEP_DOWN)
-        assert np.isinf(found.r).all()
-    assert np.isinf(find_edges(xyz, ~is_ground, stands, MAX_STEP_DOWN).r).all()
+        assert np.isinf(find_edges(xyz[:n], *(m[:n] for m in masks), MAX_STEP_DOWN).r).all()
 
 
 def test_scan_ends_at_the_edge_and_occupancy_has_it():
@@ -283,30 +282,23 @@ def test_off_nothing_is_looked_for(monkeypatch):
 
 
 def test_edges_lie_where_the_ground_ends_in_any_frame():
-    """A tilted sensor, and a cloud in the frame of the vehicle."""
-    terrain, sensor = drop(6.0, 0.6, 0.3), MOUNTED['hdl-64e']
-    matrix = rotation(0.15, -0.2)
-
-    def along(cloud, matrix):
+    """A level sensor, a tilted one, and a cloud in the frame of the vehicle."""
+    terrain, sensor, turn = drop(6.0, 0.6, 0.3), MOUNTED['hdl-64e'], rotation(0.15, -0.2)
+    level = segmented(terrain, sensor)
+    tilt = {'sensor.roll': 0.15, 'sensor.pitch': -0.2}
+    given = {f'sensor.{name}': value for name, value in
+             (('height', 0.0), ('origin_x', 1.0), ('origin_z', sensor.height))}  # fmt: skip
+    mounted = dataclasses.replace(sensor, origin=(1.0, 0.0, sensor.height))
+    vehicle = segmented(terrain, mounted, **given)
+    clouds = [
+        (level, np.eye(3), 0.0),
+        (published(level.points @ turn.astype(np.float32), **tilt), turn, 0.0),
+        (vehicle, np.eye(3), math.cos(0.3)),
+    ]
+    for cloud, matrix, forward in clouds:
         x, y = cloud.blocked
         x, y = (np.stack([x, y, 0.0 * x], axis=-1) @ matrix.T)[:, :2].T
-        found = (x * math.cos(0.3) + y * math.sin(0.3))[np.count_nonzero(cloud.is_obstacle) :]
-        assert len(found) > 800
-        return found
-
-    level = segmented(terrain, sensor)
-    expected = along(level, np.eye(3))
-    assert np.median(expected) == pytest.approx(5.85, abs=0.15)
-
-    xyz = level.points @ matrix.astype(np.float32)
-    places = along(published(xyz, **{'sensor.roll': 0.15, 'sensor.pitch': -0.2}), matrix)
-    assert np.median(places) == pytest.approx(np.median(expected), abs=0.05)
-    assert len(places) == pytest.approx(len(expected), rel=0.05)
-
-    height = sensor.height
-    mounted = dataclasses.replace(sensor, origin=(1.0, 0.0, height))
-    given = {'sensor.height': 0.0, 'sensor.origin_x': 1.0, 'sensor.origin_z': height}
-    vehicle = segmented(terrain, mounted, **given)
-    places = along(vehicle, np.eye(3))
-    assert np.median(places) == pytest.approx(np.median(expected) + math.cos(0.3), abs=0.1)
+        along = (x * math.cos(0.3) + y * math.sin(0.3))[np.count_nonzero(cloud.is_obstacle) :]
+        assert np.median(along) == pytest.approx(5.85 + forward, abs=0.15)
+        assert len(along) == pytest.approx(len(level.edges), rel=0.05) and len(along) > 800
     assert np.median(vehicle.edges[:, 2]) == pytest.approx(0.0, abs=0.1)
