@@ -159,7 +159,7 @@ def test_what_is_not_needed_is_not_checked():
     assert point_cloud2.select_points(cloud, np.zeros(0, dtype=bool)).width == 0
     layout = kitti_layout(row_step=0)
     np.testing.assert_array_equal(read_xyz(layout), read_xyz(kitti_layout()))
-    assert ALL(layout).data.tobytes() == kitti_layout().data
+    assert select_all(layout).data.tobytes() == kitti_layout().data
 
 
 def field(name, /, **changes):
@@ -170,11 +170,10 @@ def append(layout):
     return point_cloud2.append_columns(layout, {'a': np.ones(5, np.uint8)})
 
 
-def selecting(mask):
-    return lambda layout: point_cloud2.select_points(layout, mask)
+def select_all(layout):
+    return point_cloud2.select_points(layout, np.ones(5, bool))
 
 
-ALL = selecting(np.ones(5, bool))
 WRONG = [
     (read_xyz, {'fields': []}, r'no field named x: must have exactly one; fields: none'),
     (read_xyz, field('z', name='up'), r'no field named z.*x, y, up, intensity'),
@@ -196,9 +195,7 @@ WRONG = [
     (read_fields, field('x', datatype=9), r'field x has datatype 9 \(unknown\)'),
     (lambda cloud: read_columns(cloud, ['z']), {'width': 0, **field('z', count=2)}, 'count 2'),
     *((call, {'data': bytes(70)}, r'data of 70 bytes: must be at least 80')
-      for call in (ALL, append)),
-    (selecting(np.ones(4, bool)), {}, r'mask of shape \(4,\).*bool of shape \(5,\)'),
-    (selecting(np.ones(5, np.uint8)), {}, 'type uint8'),
+      for call in (select_all, append)),
 ]  # fmt: skip
 
 
