@@ -45,16 +45,6 @@ def test_generated_files_are_up_to_date():
     assert {f'config/{path.name}' for path in (REPOSITORY / 'config').glob('*.yaml')} <= set(files)
 
 
-def test_the_page_of_parameters_has_its_table_and_all_parameters():
-    files = generate.generated_files(''.join(generate.marks_of(generate.SCORES)))
-    source = [files['docs/parameters.md']]
-    load_script('docs/conf.py').insert_code(None, 'parameters', source)
-    table, _, listing = source[0].partition(generate.ALL_PARAMETERS)
-    assert table.endswith(generate.to_markdown_table()) and listing == ''
-    (path,) = re.findall('^```{literalinclude} (.*)$', source[0], re.MULTILINE)
-    assert (REPOSITORY / 'docs' / path).samefile(REPOSITORY / 'config' / 'default.yaml')
-
-
 def test_the_presets_are_those_promised_and_another_is_refused():
     assert list(PRESETS) == ['default', 'paper'] and PRESETS['default'].config == Config()
     with pytest.raises(
@@ -126,10 +116,6 @@ def test_check_says_who_reads_a_file_and_how_much_it_gives(
 
 
 def test_file_goes_over_preset_and_setting_over_file(tmp_path, capsys):
-    for name in PRESETS:
-        assert run('config', 'dump', '--preset', name) == 0
-        text = (REPOSITORY / 'config' / f'{name}.yaml').read_text(encoding='utf-8')
-        assert capsys.readouterr().out == text, GENERATE
     path = tmp_path / 'my.yaml'
     path.write_text('grid: {n_bins: 77, n_segments: 66}\n')
     words = '--preset', 'paper', '--config', path, '--set', 'grid.n_segments=55'

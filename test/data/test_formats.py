@@ -88,13 +88,10 @@ def test_what_is_written_is_read_back_bit_for_bit(tmp_path_factory, suffix, data
 def test_what_a_format_beside_its_points_says_is_kept(tmp_path):
     fields = sample(60)
     header = PcdHeader(20, 3, '1 2 3 0 1 0 0')
-    path = tmp_path / 'a.pcd'
-    again = decode_file(path, encode(path, fields, header))
-    assert again.header == header
-    found = decode_file(path, encode(path, again.fields[:10], again.header))
-    assert found.header[:3] == (10, 1, header[2])
-    path = tmp_path / 'a.ply'
-    assert decode_file(path, encode(path, fields, ['comment mine'])).header == ['comment mine']
+    for name, known in (('a.pcd', header), ('a.ply', ['comment mine'])):
+        assert decode_file(Path(name), encode(Path(name), fields, known)).header == known
+    found = decode_file(Path('a.pcd'), encode(Path('a.pcd'), fields[:10], header))
+    assert found.header == (10, 1, header[2])
     path = tmp_path / 'a.npz'
     np.savez(path, pose=np.eye(4), **{name: fields[name] for name in fields.dtype.names})
     path.write_bytes(encode_file(path, read_file(path), {'label': np.zeros(60, np.uint8)}))

@@ -141,15 +141,8 @@ def test_commands_refuse_wrong_data_and_name_the_option(tmp_path, capsys):
         said = error_line(capsys)
         assert re.search(r'000000\.bin: read with 4 columns .*: use --columns 5$', said)
         assert [path.name for path in tmp_path.iterdir()] == ['root']
+    write_ros2_bag(out)
+    for name, n, message in ((out, 5, 'is for .bin scans, which '), (scan, 2, 'at least 3')):
+        assert run('segment', name, '-o', f'{out}.label', '--columns', n) == 2
+        assert message in error_line(capsys)
     assert run('segment', scan, '-o', f'{out}.label', '--columns', '5') == 0
-
-
-def test_columns_are_for_files_of_scans_and_at_least_three(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    write_ros2_bag(tmp_path / 'a.mcap')
-    assert run('segment', 'a.mcap', '-o', 'OUT.mcap', '--columns', '5') == 2
-    assert error_line(capsys) == '--columns: is for .bin scans, which a.mcap is not'
-    assert [path.name for path in tmp_path.iterdir()] == ['a.mcap']
-    for wrong in ('2', '-1', 'x'):
-        assert run('segment', 'a.bin', '--columns', wrong) == 2
-        assert 'at least 3' in error_line(capsys)
