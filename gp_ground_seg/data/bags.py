@@ -339,17 +339,11 @@ class BagWriter:
     def add_topic(self, name: str, msgtype: str = POINT_CLOUD2) -> None:
         """Declare a topic of a type of ROS 2 Jazzy, before its first message.
 
-        It is offered reliably: with best effort, large clouds get lost when played.
+        Without a profile of its own it is played reliably: with best effort large clouds get lost.
         """
-        from rosbags import interfaces as ros
-
-        forever = ros.QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
-        history, liveliness = ros.QosHistory.KEEP_LAST, ros.QosLiveliness.AUTOMATIC
-        kind = ros.QosReliability.RELIABLE, ros.QosDurability.VOLATILE
-        qos = ros.Qos(history, 10, *kind, forever, forever, liveliness, forever, False)
         with writing(self.path):
             self._connections[name] = self._writer.add_connection(
-                name, msgtype, typestore=jazzy_types(), offered_qos_profiles=[qos]
+                name, msgtype, typestore=jazzy_types()
             )
 
     def write(self, topic: str, time: int, raw: bytes | memoryview) -> None:

@@ -97,10 +97,8 @@ def _shapes(arrays: Columns) -> str:
 def _encode_npy(cloud: Cloud) -> bytes:
     """File of a structured array."""
     file = io.BytesIO()
-    is_ascii = ''.join(cloud.fields.dtype.names or ()).isascii()
-    # Without numpy's warning that names beyond ASCII need numpy 1.17.
-    version = None if is_ascii else (3, 0)
-    np.lib.format.write_array(file, cloud.fields, version, allow_pickle=False)
+    # Of numpy 1.17: names may be beyond ASCII.
+    np.lib.format.write_array(file, cloud.fields, (3, 0), allow_pickle=False)
     return file.getvalue()
 
 
