@@ -152,13 +152,11 @@ def in_types(
         values = values.astype(f'<{code}')
         word = '_'.join(name.split())
         word = 'field' if word in ('', '_') else word  # _ is the padding of a PCD
-        if flat and values.ndim > 1:
-            table = values.reshape(len(values), math.prod(values.shape[1:]))
-            names += [f'{word}_{k}' for k in range(table.shape[1])]
-            columns += list(table.T)
-        else:
-            names.append(word)
-            columns.append(values)
+        parts = [values]
+        if is_split := flat and values.ndim > 1:
+            parts = list(values.reshape(len(values), math.prod(values.shape[1:])).T)
+        names += [f'{word}_{k}' if is_split else word for k in range(len(parts))]
+        columns += parts
     return gather(dict(zip(distinct(names), columns, strict=True)))
 
 

@@ -149,8 +149,7 @@ def _find_files(source: Path) -> Sequence[Path]:
 def _without_output(files: Sequence[Path]) -> Sequence[Path]:
     """Leave out files that are named as the output of another one."""
     stems = {_stem(file) for file in files}
-    sources = {stem: _OUTPUT.sub('', stem) for stem in stems}
-    outputs = {stem for stem, source in sources.items() if source != stem and source in stems}
+    outputs = {stem for stem in stems if _OUTPUT.sub('', stem) in stems - {stem}}
     kept = [file for file in files if _stem(file) not in outputs]
     if n_left_out := len(files) - len(kept):
         LOGGER.info('output of earlier runs left out: %d of %d files', n_left_out, len(files))
