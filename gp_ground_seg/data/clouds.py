@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+import logging
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import LOGGER, PointCloudError
+from gp_ground_seg.core.errors import PointCloudError, log_once
 
 Fields = npt.NDArray[np.void]
 Columns = dict[str, npt.NDArray[Any]]
@@ -58,12 +58,6 @@ class Cloud:
 def coordinate_names(names: Collection[str]) -> list[str]:
     """Names of x, y and z, which some programs write as capitals."""
     return [name if name in names else name.upper() for name in 'xyz']
-
-
-@functools.cache
-def note(text: str) -> None:
-    """Log a text once, however many files it is about."""
-    LOGGER.info(text)
 
 
 def cloud_of(fields: Fields, header: Any = None) -> Cloud:
@@ -212,6 +206,7 @@ def read_lines(text: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
         values, table = np.split(table.reshape(n_points, -1), [math.prod(shape)], axis=1)
         columns[name] = values.astype(own).reshape(-1, *shape)
         if own.kind != 'f' and (columns[name].reshape(values.shape) != values).any():
-            note(f'field {name}: has numbers that are no {own}; read as float64')
+            said = f'field {name}: has numbers that are no {own}; read as float64'
+            log_once(logging.INFO, said)
             columns[name] = values.reshape(-1, *shape)
     return gather(columns)

@@ -75,7 +75,6 @@ def test_packed_bags_are_read(tmp_path, storage, mode):
         topic = writer.add_connection('/points', POINT_CLOUD2, typestore=jazzy_types())
         for k, data in enumerate(raw):
             writer.write(topic, k, data)
-    assert is_bag_folder(tmp_path / 'drive')
     assert read_all(tmp_path / 'drive') == [('/points', k, data) for k, data in enumerate(raw)]
 
 
@@ -83,9 +82,7 @@ def test_clouds_of_ros1(tmp_path):
     """A definition of another topic that cannot be parsed does not matter."""
     path = tmp_path / 'drive.bag'
     samples.write_ros1_bag(path)
-    content = path.read_bytes()
-    assert b'float64 value' in content
-    path.write_bytes(content.replace(b'float64 value', b'float64 **** '))
+    path.write_bytes(path.read_bytes().replace(b'float64 value', b'float64 **** '))
     with BagReader(path) as bag:
         assert bag.storage == 'ros1'
         topic = bag.pick_point_cloud_topic()

@@ -14,9 +14,10 @@ from foreign_files import CASES, XYZ
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gp_ground_seg.core import errors
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.cloud_files import WRITABLE, decode_file, encode_file
-from gp_ground_seg.data.clouds import cloud_of, name_columns, note
+from gp_ground_seg.data.clouds import cloud_of, name_columns
 from gp_ground_seg.data.inputs import list_inputs
 
 
@@ -63,7 +64,7 @@ def test_what_is_needed_is_read_of_every_file_or_the_reason_said(tmp_path, name)
 
 def test_what_is_left_out_is_told_once(tmp_path, caplog):
     caplog.set_level('INFO', 'gp_ground_seg')
-    note.cache_clear()
+    errors._logged.clear()
     for name in ('list_last.ply', 'list_last_text.ply', 'list_last_big.ply', 'nan_as_integer.pcd'):
         decode_file(tmp_path / name, CASES[name][0])
     assert caplog.messages == [

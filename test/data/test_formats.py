@@ -81,8 +81,7 @@ def test_what_is_written_is_read_back_bit_for_bit(tmp_path_factory, suffix, data
             assert parts.tobytes() == fields[name].tobytes()
             fields = fields[[other for other in fields.dtype.names if other != name]]
     assert_fields(found, fields)
-    taken = 'gp_label' if 'label' in fields.dtype.names else 'label'
-    assert found[taken].dtype == np.uint8
+    assert found['gp_label' if 'label' in fields.dtype.names else 'label'].dtype == np.uint8
 
 
 def test_what_a_format_beside_its_points_says_is_kept(tmp_path):

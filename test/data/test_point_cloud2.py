@@ -153,8 +153,7 @@ def test_coordinates_side_by_side_are_not_copied():
 
 
 def test_what_is_not_needed_is_not_checked():
-    empty = Layout(0, 0, [], False, 0, 0, b'')
-    assert read_xyz(empty).shape == (0, 3)
+    assert read_xyz(Layout(0, 0, [], False, 0, 0, b'')).shape == (0, 3)
     cloud = cloud_from_columns((0, 0), 'lidar', {})
     assert point_cloud2.select_points(cloud, np.zeros(0, dtype=bool)).width == 0
     layout = kitti_layout(row_step=0)
