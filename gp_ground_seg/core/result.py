@@ -39,11 +39,9 @@ NO_GROUND = 'next to nothing of the scan is ground: is sensor.height right, and 
 _Value = TypeVar('_Value')
 
 
-class cached_property(functools.cached_property[_Value]):  # noqa: N801 - a decorator
+def cached_property(compute: Callable[[Any], _Value]) -> functools.cached_property[_Value]:
     """``functools.cached_property``, computed whatever ``np.seterr`` the caller has."""
-
-    def __init__(self, compute: Callable[[Any], _Value]) -> None:
-        super().__init__(usual_errors()(compute))
+    return functools.cached_property(usual_errors()(compute))
 
 
 @dataclass(frozen=True)
