@@ -17,7 +17,7 @@ from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
+from gp_ground_seg.data.bags import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.cloud_files import FORMATS, LABELS, format_for
 from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.inputs import Inputs, holds_bag, list_inputs

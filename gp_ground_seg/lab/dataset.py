@@ -15,8 +15,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.bag_files import BAG_SUFFIXES
-from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud
+from gp_ground_seg.data.bags import BAG_SUFFIXES, BagReader, BagWriter, decode_cloud, encode_cloud
 from gp_ground_seg.data.cloud_files import encode_output
 from gp_ground_seg.data.files import changed_at, read_bytes, remove_leftovers, write_file
 from gp_ground_seg.data.inputs import Input

@@ -89,8 +89,7 @@ FOLDERS = {
     ),
     'SemanticKITTI': (['velodyne/000007.bin', 'labels/000007.label'], ['000007']),
     'nuScenes': (['samples/LIDAR_TOP/a__LIDAR_TOP__1.pcd.bin'], ['a__LIDAR_TOP__1']),
-    'sequences': (['sequences/00/velodyne/0.bin'], r'give one of its sequences \(00\), as in'),
-    'texts': (['a.xyz'], r'no \.bin, .* file in it, .*; a\.xyz may be a text of points'),
+    'sequences': (['sequences/00/velodyne/0.bin'], r'no \.bin, .* file in it, and not a rosbag2'),
 }
 
 

@@ -11,8 +11,7 @@ import pytest
 from evaluation_samples import write_frame
 
 from gp_ground_seg.cli.bags import EPOCH
-from gp_ground_seg.data.bag_files import POINT_CLOUD2
-from gp_ground_seg.data.bags import BagReader, decode_cloud, stamp_of
+from gp_ground_seg.data.bags import POINT_CLOUD2, BagReader, decode_cloud, stamp_of
 
 TOPIC = '/kitti/velo/pointcloud'
 TIMES = [0.0, 0.1036219, 0.2072, 0.311, 0.415]
