@@ -33,12 +33,13 @@ def test_reliability_asked_for_is_kept(reliability):
         b.segment(message)
         b.publisher = b.probe.create_publisher(PointCloud2, 'points', ros.BEST_EFFORT)
         b.wait_for_status('input', lambda v, _: v['Publishers'] == '2')
-        b.publish_until(message, lambda: len(b.diagnostics.messages) > 15, 'a second of clouds')
-        assert b.node._input.qos_words == f'{reliability}, keep_last 9, volatile'
         # A reliable reader gets nothing from the second publisher, and says so.
-        status = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.STALE)
         said = 'qos_overrides asks for reliable, and a publisher offers best effort'
-        assert (said in status.message) == (reliability == 'reliable')
+        if reliability == 'reliable':
+            b.wait_for_status('input', lambda _, s: said in s.message)
+        else:
+            b.publish_until(message, lambda: len(b.ground.messages) > 1, 'answer')
+        assert b.node._input.qos_words == f'{reliability}, keep_last 9, volatile'
 
 
 def test_a_lazy_node_listens_only_while_somebody_listens_to_it():
@@ -54,12 +55,9 @@ def test_a_lazy_node_listens_only_while_somebody_listens_to_it():
         wait_until_listening(0)
         status = b.wait_for_status(
             'input', lambda v, s: s.level == DiagnosticStatus.OK and v['Publishers'] == '1'
-            and float(v['Time since last cloud (s)']) > 1.0
+            and float(v['Time since last cloud (s)']) > 0.6
         )  # fmt: skip
         assert 'no output has a subscriber (input.lazy)' in status.message
-        for is_lazy in (False, True):
-            assert b.set('input.lazy', is_lazy).successful
-            wait_until_listening(1 - is_lazy)
         # What nobody wanted is not lost.
         for _ in range(5):
             b.publisher.publish(message)
@@ -72,7 +70,7 @@ def test_a_lazy_node_listens_only_while_somebody_listens_to_it():
 
 def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(tmp_path):
     points = street(3000)
-    limits = '-p', 'diagnostics.stale_after:=3.0', '-p', 'diagnostics.max_latency:=10.0'
+    limits = '-p', 'diagnostics.stale_after:=1.0', '-p', 'diagnostics.max_latency:=10.0'
     with ros.stderr_in(tmp_path) as stderr, ros.bench(*OFTEN, *limits) as b:
 
         def segment(*seconds):
@@ -83,17 +81,15 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(tmp_path):
         assert f'{NAMESPACE}/points' in stale.message
         segment(0, 1, 2, 0, 1, 0)
         b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.OK)
-        counters = {
-            'input': 'Events since startup', 'processing': 'Clouds since startup',
-            'model': 'Learned since startup', 'output': f'{NAMESPACE}/ground since startup',
-        }  # fmt: skip
+        counters = {'input': 'Events since startup', 'processing': 'Clouds since startup'}
         tasks = {
-            task: b.wait_for_status(task, lambda v, _, counter=counter: v.get(counter) == '6')
+            task: b.wait_for_status(task, lambda v, _, counter=counter: v[counter] == '6')
             for task, counter in counters.items()
         }
-        # Throttled: two jumps, one message.
-        said = ros.said_by(stderr, 'time jumped back by 2.0 s')
-        assert said.count('time jumped back') == 1
+        tasks['model'] = b.wait_for_status('model', lambda v, _: v)
+        # Throttled: two jumps, one message; clouds for half a second, one line on them.
+        said = ros.said_by(stderr, 'time jumped back by 2.0 s', 'clouds segmented so far: ')
+        assert said.count('time jumped back') == said.count('segmented so far') == 1
         assert b.set('diagnostics.max_latency', 0.001).successful
         b.wait_for_status('processing', lambda _, s: s.level == DiagnosticStatus.WARN)
         node_name = b.node_name
@@ -101,16 +97,12 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(tmp_path):
     for status in tasks.values():
         assert (status.level, status.hardware_id) == (DiagnosticStatus.OK, node_name)
     values = {task: ros.values_of(status) for task, status in tasks.items()}
-    outputs = (f'{node_name}/{name}' for name in ('labeled', 'ground_model', 'scan', 'occupancy'))
-    topics = f'{NAMESPACE}/ground', f'{NAMESPACE}/obstacles', *outputs
-    assert [key.split()[0] for key in values['output']][::3] == [*topics]
     # A stamp of 2011 is old, and nothing is wrong with that.
     assert float(values['input']['Age of last stamp (s)']) > 1e8
     expected = {'Fields': ' '.join(ros.POINT.names), 'QoS': 'reliable, keep_last 1, volatile'}
-    expected |= {'Publishers': '1', 'Clock': 'system time', 'Time jumps since startup': '2'}
+    expected |= {'Publishers': '1', 'Time jumps since startup': '2'}
     assert expected.items() <= values['input'].items()
     assert values['processing']['Backend'] in ('numba', 'numpy')
-    assert values['output'][f'{NAMESPACE}/ground subscribers'] == '1'
 
 
 def test_simulated_time_that_jumps_back_is_counted_once():
@@ -135,7 +127,6 @@ def test_simulated_time_that_jumps_back_is_counted_once():
         # A stamp of 2011 is half a second old: ages are on the node's clock.
         values = wait_for_input('Events since startup', '2')
         assert values['Age of last stamp (s)'] == '0.500'
-        assert values['Clock'] == 'simulated, from /clock'
         tell(1317382000)
         wait_for_input('Time jumps since startup', '1')
         # The first cloud of the next round: the same jump.
@@ -332,9 +323,9 @@ def test_the_wait_of_a_cloud_is_a_part_of_its_latency(b, monkeypatch):
 
 
 def test_error_in_a_report_does_not_end_the_node(b, monkeypatch):
-    monkeypatch.setattr(b.node, '_outputs', None)
+    monkeypatch.setattr(b.node._diagnostics, 'processing', None)
     status = b.wait_for_status('diagnostics', lambda *_: True)
     assert status.level == DiagnosticStatus.ERROR
     assert 'NoneType' in status.message
     monkeypatch.undo()
-    b.wait_for_status('output', lambda *_: True)
+    b.wait_for_status('processing', lambda *_: True)

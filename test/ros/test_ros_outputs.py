@@ -16,8 +16,8 @@ from gp_ground_seg.data import costmap
 from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_columns, read_xyz
 from gp_ground_seg.ros import outputs
-from gp_ground_seg.ros.ground_model import read_ground_model
 from gp_ground_seg.ros.outputs import LABELLED_FIELDS as FIELDS
+from gp_ground_seg.ros.outputs import read_ground_model
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 

@@ -102,6 +102,6 @@ def test_the_aggregator_of_the_diagnostics_finds_our_statuses():
     (found,) = (one for one in snippets('node.md')[1] if 'analyzers' in one)
     group = found['analyzers']['ros__parameters']['ground_segmentation']
     (part,) = group['contains']
-    tasks = ('input', 'processing', 'model', 'output')
+    tasks = ('input', 'processing', 'model')
     assert all(part in f'front/{NODE_NAME}: {task}' for task in tasks)
     assert group['num_items'] == len(tasks)
