@@ -40,37 +40,27 @@ from gp_ground_seg.ros.node import GroundSegmentationNode, main
 # Other tests run beside this one, also as workers of pytest-xdist; nothing of them must be heard.
 _WORKER = os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw')
 _SESSION = os.getppid() if _WORKER else os.getpid()
-DOMAIN_ID = 1 + (4 * _SESSION + int(_WORKER or 0)) % 100
 NAMESPACE = f'/test_{_SESSION}'
 ISOLATION = {
     'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-    'ROS_DOMAIN_ID': str(DOMAIN_ID),
+    'ROS_DOMAIN_ID': str(1 + (4 * _SESSION + int(_WORKER or 0)) % 100),
     'RCUTILS_COLORIZED_OUTPUT': '0',
 }
+os.environ.update(ISOLATION)
 
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 @contextlib.contextmanager
-def isolated(**changes):
-    """The environment of the domain of these tests, on this machine only."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in {**ISOLATION, **changes}.items():
-            patch.setenv(name, value)
-        yield
-
-
-@contextlib.contextmanager
 def isolated_context():
     """A context of that domain."""
     context = Context()
-    with isolated():
-        try:
-            rclpy.init(context=context, args=[], domain_id=DOMAIN_ID)
-            yield context
-        finally:
-            rclpy.try_shutdown(context=context)
+    rclpy.init(context=context, args=[])
+    try:
+        yield context
+    finally:
+        rclpy.try_shutdown(context=context)
 
 
 @contextlib.contextmanager
@@ -183,7 +173,8 @@ IN_NAMESPACE = ('--ros-args', '-r', f'__ns:={NAMESPACE}')
 
 
 def given(values):
-    """Words that give parameters their values."""
+    """Words that give parameters their values; diagnostics come often unless they say else."""
+    values = {'diagnostics.period': 0.1, **values}
     return [word for k, v in values.items() for word in ('-p', f'{k}:={str(v).lower()}')]
 
 
@@ -195,7 +186,7 @@ class Process:
         with self._log.open('wb') as log:
             self.popen = subprocess.Popen(
                 command or [sys.executable, *start, *words],
-                env={**os.environ, **ISOLATION, **environment},
+                env={**os.environ, **environment},
                 stdout=subprocess.DEVNULL, stderr=log,
             )  # fmt: skip
 
@@ -346,10 +337,9 @@ class Link:
 class Bench(Link):
     """The node under test in this process, beside the probe that talks to it."""
 
-    def __init__(self, context, *words):
-        cli_args = ['--ros-args', '-r', f'__ns:={NAMESPACE}', *words]
+    def __init__(self, context, values):
+        cli_args = [*IN_NAMESPACE, *given(values)]
         self.node = GroundSegmentationNode(context=context, cli_args=cli_args)
-        self.node_name = self.node.get_fully_qualified_name()
         super().__init__(context)
 
     def wait_until_settled(self):
@@ -359,10 +349,14 @@ class Bench(Link):
 
     def listen(self, topic, message_type=PointCloud2):
         """A `Collector` of an optional output, once the node knows of it and of no other."""
-        publisher = next(p for o, p in self.node._outputs._publishers if o.topic == topic)
-        wait_for(lambda: publisher.get_subscription_count() == 0, f'end of ears of {topic}')
+        optional = [p for o, p in self.node._outputs._publishers if o.is_optional]
+
+        def wait_until_heard(n):
+            wait_for(lambda: sum(p.get_subscription_count() for p in optional) == n, f'{n} ears')
+
+        wait_until_heard(0)
         collector = Collector(self.probe, message_type, topic.replace('~', NODE_NAME))
-        wait_for(lambda: publisher.get_subscription_count() == 1, f'ear of {topic}')
+        wait_until_heard(1)
         return collector
 
     @contextlib.contextmanager
@@ -373,6 +367,10 @@ class Bench(Link):
         yield
         self.load(before)
 
+    def forget(self, collector):
+        """End what `collector` listens to."""
+        self.in_executor(self.probe.destroy_subscription, collector.subscription)
+
     def in_executor(self, function, *arguments):
         """Result of a call made between two waits, where entities may safely go."""
         task = self.node.executor.create_task(function, *arguments)
@@ -381,10 +379,10 @@ class Bench(Link):
 
 
 @contextlib.contextmanager
-def bench(*words, settled=True):
-    """A connected `Bench`, the node started with ``--ros-args words``."""
+def bench(values=None, settled=True):
+    """A connected `Bench`, the node with these values of parameters."""
     with isolated_context() as context:
-        b = Bench(context, *words)
+        b = Bench(context, values or {})
         with spinning(context, b.node, b.probe):
             b.wait_until_connected()
             if settled:
@@ -403,11 +401,11 @@ def linked(sends=RELIABLE):
 
 
 @contextlib.contextmanager
-def linked_process(folder, *words, sends=RELIABLE, **environment):
+def linked_process(folder, values, **options):
     """A `Process` in our namespace, and a `Link` to it."""
-    with Process(*IN_NAMESPACE, *words, folder=folder, **environment) as node:
+    with Process(*IN_NAMESPACE, *given(values), folder=folder, **options) as node:
         node.wait_until_ready()
-        with linked(sends) as link:
+        with linked() as link:
             yield node, link
 
 
@@ -422,9 +420,7 @@ def started_node(*words):
 
 def start_error(capfd, *words):
     """Line that the node ends with when it refuses to start with ``--ros-args words``."""
-    # The domain may be what is wrong.
-    with isolated(ROS_DOMAIN_ID=os.environ.get('ROS_DOMAIN_ID', str(DOMAIN_ID))):
-        assert main(['--ros-args', *words]) == 2
+    assert main(['--ros-args', *words]) == 2
     said = capfd.readouterr()
     assert said.out == '' and 'Traceback' not in said.err
     line = said.err.splitlines()[-1]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import ros_helpers as ros
 from nav_msgs.msg import OccupancyGrid
-from ros_helpers import street, to_message, wait_for, xyz_of
+from ros_helpers import street, to_message, xyz_of
 from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 
 from gp_ground_seg import Config, GroundSegmenter, Label
@@ -30,7 +30,7 @@ CONFIG = Config().replace(**{'learning.mode': 'fixed'})
 
 @pytest.fixture(scope='module')
 def b():
-    with ros.bench('-p', 'learning.mode:=fixed') as shared:
+    with ros.bench({'learning.mode': 'fixed'}) as shared:
         yield shared
 
 
@@ -39,7 +39,7 @@ def received(b, topic, message):
     collector = b.listen(topic, OPTIONAL[topic])
     b.segment(message)
     answer = collector.wait(1)[0]
-    b.in_executor(b.probe.destroy_subscription, collector.subscription)
+    b.forget(collector)
     return answer
 
 
@@ -148,12 +148,10 @@ def test_occupancy_is_what_a_costmap_takes(b, reduced):
 
 def test_the_time_of_a_scan_is_that_between_clouds(b):
     collector = b.listen('~/scan', LaserScan)
-    for n, (sec, nanosec) in enumerate([(100, 0), (100, 10**8), (105, 0)], 1):
-        message = to_message(street(500))
-        message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
-        b.segment(message)
+    for n, stamp in enumerate([(100, 0), (100, 10**8), (105, 0)], 1):
+        b.segment(to_message(street(500), stamp))
         collector.wait(n)
-    b.in_executor(b.probe.destroy_subscription, collector.subscription)
+    b.forget(collector)
     # After a pause it says nothing.
     assert [scan.scan_time for scan in collector.messages[1:]] == pytest.approx([0.1, 0.0])
 
@@ -170,30 +168,24 @@ def test_nothing_is_built_that_nobody_subscribes_to(b, monkeypatch):
 
     rows = [(counted(output), publisher) for output, publisher in b.node._outputs._publishers]
     monkeypatch.setattr(b.node._outputs, '_publishers', rows)
-    message = to_message(street(500))
-    for topic in OPTIONAL:
-        received(b, topic, message)
+    for topic in OPTIONAL:  # each begins with the end of the one before
+        received(b, topic, to_message(street(500)))
         assert built == ['ground', 'obstacles', topic]
-        publisher = next(p for o, p in rows if o.topic == topic)
-        wait_for(lambda p=publisher: p.get_subscription_count() == 0, 'end of the subscription')
         built.clear()
-        b.segment(message)
-        assert built == ['ground', 'obstacles']
-        built.clear()
+
+
+OTHER_QOS = {'depth': 3, 'reliability': 'best_effort'}
 
 
 def test_quality_of_service_of_every_output_can_be_overridden():
     topics = [o.topic for o in outputs.OUTPUTS]
     assert set(topics) == {'ground', 'obstacles', *OPTIONAL}
-    values = {}
-    for topic in topics:
-        name = '/' + topic.replace('~', NODE_NAME)
-        values[f'qos_overrides.{name}.publisher.depth'] = 3
-        values[f'qos_overrides.{name}.publisher.reliability'] = 'best_effort'
+    names = (f'qos_overrides./{topic.replace("~", NODE_NAME)}.publisher' for topic in topics)
+    values = {f'{name}.{k}': v for name in names for k, v in OTHER_QOS.items()}
     with ros.started_node(*ros.given(values)) as node:
         for _, publisher in node._outputs._publishers:
-            assert publisher.qos_profile.depth == 3
-            assert publisher.qos_profile.reliability.name == 'BEST_EFFORT'
+            qos = publisher.qos_profile
+            assert {'depth': qos.depth, 'reliability': qos.reliability.short_key} == OTHER_QOS
 
 
 # Clouds of four layouts through the real node, over DDS; test_point_cloud2.py has any.
@@ -249,7 +241,7 @@ def test_every_byte_comes_through_with_labels_as_of_the_library(b, case):
     assert parts[0].width + parts[1].width == np.isfinite(xyz).all(axis=1).sum()
 
     (whole,) = labelled.wait(1)
-    b.in_executor(b.probe.destroy_subscription, labelled.subscription)
+    b.forget(labelled)
     for name in ('header', 'height', 'width', 'is_bigendian'):
         assert getattr(whole, name) == getattr(message, name)
     assert whole.row_step == message.width * whole.point_step
