@@ -34,7 +34,7 @@ NAMES = [spec.name for spec in SPECS]
 
 @pytest.fixture(scope='module')
 def shared():
-    with bench() as b:
+    with bench({'diagnostics.period': Config().diagnostics.period}) as b:
         assert values_of(b) == Config().flat()
         yield b
 
@@ -104,37 +104,38 @@ def test_a_change_takes_effect_with_the_next_cloud(b, tmp_path):
         assert n_ground(points, Config()) != n_ground(points, narrow)
 
 
-@pytest.mark.parametrize(
-    ('name', 'value', 'reason'),
-    [
-        ('sensor.height', 30.0, 'sensor.height = 30.0: must be auto or a number in [-5, 20] m'),
-        ('grid.n_segments', 3, 'grid.n_segments = 3: must be an integer in [4, 2048]'),
-        ('grid.n_segments', 90.0, 'grid.n_segments = 90.0: must be an integer in [4, 2048]'),
-        ('runtime.backend', 'gpu', "runtime.backend = 'gpu': must be one of auto, numba, numpy"),
-        ('grid.r_max', 1.5, 'grid.r_min = 2: must be below grid.r_max = 1.5'),
-        ('input.crop_box', [1.0, -1.0, 0.0, 1.0, 0.0, 1.0], 'must be none or six numbers in ['),
-        ('lable.ground_tolerance', 0.1, 'did you mean label.ground_tolerance?'),
+WRONG = {
+    'sensor.height': [
+        'sensor.height = 30.0: must be auto or a number in [-5, 20] m', 30.0, 'Auto', 'automatic',
+        '', '0.5', True, 99, math.nan, math.inf, [0.5], None,
     ],
-)
-def test_a_bad_value_is_refused_with_a_reason_and_changes_nothing(b, name, value, reason):
-    assert reason in b.refusal(name, value)
+    'grid.n_segments': ['grid.n_segments = 3: must be an integer in [4, 2048]', 3, 90.0],
+    'runtime.backend': ["runtime.backend = 'gpu': must be one of auto, numba, numpy", 'gpu'],
+    'grid.r_max': ['grid.r_min = 2: must be below grid.r_max = 1.5', 1.5],
+    'input.crop_box': ['must be none or six numbers in [', [1.0, -1.0, 0.0, 1.0, 0.0, 1.0]],
+    'lable.ground_tolerance': ['did you mean label.ground_tolerance?', 0.1],
+}  # fmt: skip
+"""For each name the reason of the first refusal, and values; the others have its end."""
+
+
+@pytest.mark.parametrize('name', WRONG)
+def test_a_bad_value_is_refused_with_a_reason_and_changes_nothing(b, name):
+    reason, first, *others = WRONG[name]
+    assert reason in b.refusal(name, first)
+    for value in others:
+        said = b.refusal(name, value)
+        assert said.startswith(f'{name} = ') and said.endswith(reason.split('must be')[1])
     assert values_of(b) == b.node.config.flat() == Config().flat()
 
 
 @pytest.mark.parametrize('name', ['sensor.height', 'sensor.roll', 'sensor.pitch'])
-def test_a_number_or_auto_is_taken_and_nothing_else(b, name):
-    for value in (0.5, 'auto', 0.7, 1, 'auto'):
+def test_a_number_or_auto_is_taken(b, name):
+    for value in (0.5, 'auto', 0.7, 'auto'):
         assert b.set(name, value).successful
-        assert values_of(b)[name] == value == b.node.config[name]
-        value = float(value) if value == 1 else value
+        assert values_of(b, [name]) == {name: value} == {name: b.node.config[name]}
         (found,) = described(b, [name])
         assert found.type == TYPES[type(value)]
         assert found.floating_point_range[0].to_value == find_spec(name).maximum
-    wrong = ['Auto', 'automatic', '', '0.5', True, 99, 99.0, math.nan, math.inf, [0.5], None]
-    for value in wrong:
-        reason = b.refusal(name, value)
-        assert f'{name} = ' in reason and 'must be auto or a number in [' in reason
-        assert values_of(b)[name] == 'auto'
 
 
 def test_several_at_once_are_all_taken_or_none(b):
@@ -159,7 +160,7 @@ def test_several_at_once_are_all_taken_or_none(b):
 
 
 @pytest.mark.parametrize('setter', ros.SETTERS)
-def test_an_integer_is_taken_for_any_number(b, setter):
+def test_an_integer_is_taken_for_any_number_and_text_for_a_box(b, setter):
     """As ``ros2 param set`` and rqt_reconfigure send what is typed without a point."""
     whole = {spec.name: int(spec.default) for spec in SPECS if str(spec.default).endswith('.0')}
     assert len(whole) > 20
@@ -169,11 +170,8 @@ def test_an_integer_is_taken_for_any_number(b, setter):
         (found,) = values_of(b, [name]).values()
         assert (type(found), found) == (float, value)
         assert b.node.config[name] == value
-
-
-def test_a_box_may_come_as_text(b):
-    """As ``ros2 param set`` sends whole numbers among others."""
-    assert b.set('input.crop_box', '[-1, 1.0, -1.0, 1.0, -1.6, 0.6]').successful
+    box = {'input.crop_box': '[-1, 1.0, -1.0, 1.0, -1.6, 0.6]'}
+    assert b.request(setter, ros.parameter_messages(box))[0].successful
     assert b.node.config.input.crop_box == (-1.0, 1.0, -1.0, 1.0, -1.6, 0.6)
 
 
@@ -214,7 +212,7 @@ def dump(b):
     return {b.node_name: {'ros__parameters': tree}}
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(config=configs(), order=st.permutations(NAMES))
 def test_any_configuration_can_be_loaded_over_any_other_in_any_order(shared, config, order):
     # TF may not be installed.
@@ -256,16 +254,15 @@ def test_changes_during_playback_lose_no_frame(b):
     for name in ('default', 'paper', 'default'):
         b.publisher.publish(message)
         assert_loaded(b, PRESETS[name].config)
-    assert b.set('learning.mode', 'fixed').successful
-    tolerances = np.linspace(0.05, 0.5, 97)
+    tolerances = np.linspace(0.05, 0.5, 27)
     for k, tolerance in enumerate(tolerances):
         b.publisher.publish(message)
         assert b.set('grid.n_segments', 90 if k % 2 else 180).successful
         is_bad = k % 10 == 9
         result = b.set('label.ground_tolerance', 9.0 if is_bad else float(tolerance))
         assert result.successful != is_bad
-    b.ground.wait(before + 100)
-    b.obstacles.wait(before + 100)
+    b.ground.wait(before + 30)
+    b.obstacles.wait(before + 30)
     assert b.node.config.label.ground_tolerance == tolerances[-1]
 
 
@@ -279,6 +276,7 @@ def test_unknown_names_are_reported_and_not_declared(tmp_path):
     }
     with ros.stderr_in(tmp_path) as stderr, ros.started_node(*ros.given(words)) as node:
         changes = {'sensor.height': 2.5, 'grid.r_max': 50.0, 'label.ground_tolerance': 1.0}
+        changes['diagnostics.period'] = 0.1
         assert node.config == Config().replace(**changes)
         for name, value in changes.items():
             assert node.get_parameter(name).type_ == Parameter.Type.DOUBLE

@@ -17,7 +17,7 @@ from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.ros.arguments import unused_files
 from gp_ground_seg.ros.session import ROS_WHEELS, ros_session, stop_on_signals
 
-FIXED = (*IN_NAMESPACE, '-p', 'learning.mode:=fixed')
+FIXED = (*IN_NAMESPACE, *ros.given({'learning.mode': 'fixed'}))
 SOON = 4.0
 """Time of the cloud at hand, and what a machine that does other things adds to it [s]."""
 QOS = 'qos_overrides./points.subscription'
@@ -83,7 +83,7 @@ def test_bad_words(monkeypatch, capfd, words):
 
 @pytest.mark.parametrize('words', ['node nonsense', 'node --ros-args -- nonsense'])
 def test_words_that_nobody_takes_are_refused(capsys, words):
-    with ros.isolated(), pytest.raises(SystemExit, match='2'):
+    with pytest.raises(SystemExit, match='2'):
         sys.exit(cli_runner.run(*words.split()))
     assert 'nonsense' in capsys.readouterr().err
 
@@ -116,29 +116,27 @@ def test_missing_ros_is_said_in_one_line(tmp_path, command):
 
 
 NAME = f'{NAMESPACE}/front/filter'
+P = '{ros__parameters: {label: {ground_tolerance: 0.3}}}'
 USED = (
-    '/**:\n  P', '"**":\n  P', f'{NAME}:\n  P', f'{NAME[1:]}:\n  P',
-    f'{NAMESPACE}:\n  front:\n    filter:\n      P', f'{NAMESPACE}/front:\n  filter:\n    P',
-    '/**/filter:\n  P', '/**:\n  filter:\n    P', '/*/*/filter:\n  P',
-    '/*/front:\n  filter:\n    P', f'{NAMESPACE}/**:\n  P', '/*/*/*:\n  P', f'{NAME}/**:\n  P',
-    f'other:\n  P\n{NAME}:\n  P',
+    '/**', '"**"', NAME, NAME[1:], f'{NAMESPACE}:\n  front:\n    filter',
+    f'{NAMESPACE}/front:\n  filter', '/**/filter', '/**:\n  filter', '/*/*/filter',
+    '/*/front:\n  filter', f'{NAMESPACE}/**', '/*/*/*', f'{NAME}/**', f'other: {P}\n{NAME}',
 )  # fmt: skip
 UNUSED = (
-    'patchworkpp_node:\n  P', 'ground_segmentation_node:\n  P', 'filter:\n  P',
-    f'{NAMESPACE}/filter:\n  P', f'{NAMESPACE}/front:\n  other:\n    P', '/**/front:\n  P',
-    f'{NAMESPACE}/*:\n  P', '"*/filter":\n  P', '/*:\n  P',
+    'patchworkpp_node', 'ground_segmentation_node', 'filter', f'{NAMESPACE}/filter',
+    f'{NAMESPACE}/front:\n  other', '/**/front', f'{NAMESPACE}/*', '"*/filter"', '/*',
 )  # fmt: skip
-"""Files, with P for parameters; in them the node has another name, or another namespace."""
+"""Keys of parameters; in them the node has another name, or another namespace."""
 
 
-@pytest.mark.parametrize('text', [*USED, *UNUSED])
-def test_a_file_is_unused_where_rcl_takes_nothing_of_it(tmp_path, text):
+@pytest.mark.parametrize('keys', [*USED, *UNUSED])
+def test_a_file_is_unused_where_rcl_takes_nothing_of_it(tmp_path, keys):
     path = tmp_path / 'keys.yaml'
-    path.write_text(text.replace('P', 'ros__parameters: {label: {ground_tolerance: 0.3}}'))
+    path.write_text(f'{keys}: {P}\n')
     words = '-r', f'__ns:={NAMESPACE}/front', '-r', '__node:=filter', '--params-file', str(path)
     with ros.started_node(*words) as node:
-        assert (node.config.label.ground_tolerance == 0.3) == (text in USED)
-        assert len(unused_files(words, node.get_fully_qualified_name())) == (text in UNUSED)
+        assert (node.config.label.ground_tolerance == 0.3) == (keys in USED)
+        assert len(unused_files(words, node.get_fully_qualified_name())) == (keys in UNUSED)
 
 
 def test_unused_files_are_warned_of_with_their_keys(tmp_path):
@@ -147,14 +145,12 @@ def test_unused_files_are_warned_of_with_their_keys(tmp_path):
         path = tmp_path / f'{name}.yaml'
         path.write_text(''.join(f'{key}:\n  ros__parameters: {{}}\n' for key in keys))
         words += ['--params-file', str(path)]
-    (first,) = unused_files([*words, '--params-file', 'gone.yaml'], '/front/filter')
-    assert first.startswith(rf'{tmp_path}/a\x1b[2J.yaml: not used: ')
-    assert 'those of b, /c/d, and this node is /front/filter' in first
-    words = *FIXED, '-p', 'runtime.backend:=numpy', *words[:2]
-    with Process(*words, folder=tmp_path) as node:
+    with Process(*FIXED, *words, folder=tmp_path) as node:
         node.wait_until_ready('not used')
         (line,) = [line for line in node.log.splitlines() if 'WARN' in line]
-        assert f'those of b, /c/d, and this node is {NAMESPACE}/ground_segmentation_node' in line
+    assert rf'{tmp_path}/a\x1b[2J.yaml: not used: ' in line
+    assert f'those of b, /c/d, and this node is {NAMESPACE}/ground_segmentation_node' in line
+    assert unused_files(['--params-file', 'gone.yaml'], '/front/filter') == []
 
 
 # Signals to the node: it ends with code 0, after the cloud at hand.
@@ -223,7 +219,7 @@ def test_under_load(tmp_path):
     """The cloud at hand is the last one; signals that follow do not break the end."""
     message = ros.to_message(ros.street(20_000))
     slow = {'runtime.backend': 'numpy', 'grid.n_segments': 360, 'learning.segment_step': 1}
-    with ros.linked_process(tmp_path, *ros.given(slow)) as (node, link):
+    with ros.linked_process(tmp_path, slow) as (node, link):
         for _ in range(6):
             link.publisher.publish(message)
         link.ground.wait(1)
@@ -258,10 +254,9 @@ STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @pytest.fixture
 def handlers(heeded_hangup):
-    """The handlers in use, which are there again after the test; other nodes are not heard."""
+    """The handlers in use, which are there again after the test."""
     before = {number: signal.getsignal(number) for number in STOPS}
-    with ros.isolated():
-        yield before
+    yield before
     for number, handler in before.items():
         signal.signal(number, handler)
 
@@ -273,23 +268,23 @@ def test_without_a_signal_all_is_as_before_and_an_error_is_an_error(handlers):
     assert {number: signal.getsignal(number) for number in STOPS} == handlers
 
 
-def wait_for_signal(number, wait, *seconds):
-    with ros_session('any') as session:
-        for _ in range(2):
-            os.kill(os.getpid(), number)  # the second changes nothing
-        if wait:
-            getattr(session, wait)(*seconds)
-            pytest.fail('not interrupted')
+WAITS = {
+    'sleep': lambda session: session.sleep(0.001),
+    'spin': lambda session: session.spin(0.001),
+    'check': lambda session: session.check(),
+    'the end of the block': lambda _session: None,
+}
 
 
 @pytest.mark.parametrize('number', STOPS)
-@pytest.mark.parametrize('wait', ['sleep 0.001', 'spin 0.001', 'check', ''])
+@pytest.mark.parametrize('wait', WAITS)
 @pytest.mark.usefixtures('handlers')
 def test_a_signal_interrupts_the_next_wait(wait, number):
-    """Also the end of the block."""
-    name, *seconds = wait.split(' ')
-    with pytest.raises(KeyboardInterrupt):
-        wait_for_signal(number, name, *map(float, seconds))
+    with pytest.raises(KeyboardInterrupt), ros_session('any') as session:
+        for _ in range(2):
+            os.kill(os.getpid(), number)  # the second changes nothing
+        WAITS[wait](session)
+        assert wait == 'the end of the block'
 
 
 @pytest.mark.usefixtures('handlers')
