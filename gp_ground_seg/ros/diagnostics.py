@@ -40,36 +40,14 @@ def judged(task: str, faults: Sequence[str], good: str, values: dict[str, str]) 
     return Status(task, Level.WARN if faults else Level.OK, '; '.join(faults) or good, values)
 
 
-class Rate:
-    """Events in all, and in the last `RATE_WINDOW` seconds."""
-
-    def __init__(self) -> None:
-        self.n_total = 0
-        self._events: deque[float] = deque()
-
-    def count(self, now: float) -> None:
-        """Count an event."""
-        self.n_total += 1
-        self._events.append(now)
-
-    def window(self, now: float) -> tuple[int, float, float | None]:
-        """Return events in the window, the time they span [s], their rate [Hz] if they do."""
-        while self._events and now - self._events[0] > RATE_WINDOW:
-            self._events.popleft()
-        n_events = len(self._events)
-        span = self._events[-1] - self._events[0] if self._events else 0.0
-        # The first event opens the span over which the others are counted.
-        return n_events, span, (n_events - 1) / span if span > 0.0 else None
-
-
 class InputTask:
     """Clouds that arrived from `source`, and those that were refused."""
 
     def __init__(self, now: float, source: CloudSubscription) -> None:
         self._source = source
         self._last_arrival = self._listening_since = now
-        self._arrivals = Rate()
-        self._n_refused = self._n_time_jumps = 0
+        self._arrivals: deque[float] = deque()  # of the last `RATE_WINDOW`
+        self._n_arrived = self._n_refused = self._n_time_jumps = 0
         # Clouds of the newest reporting period that had any.
         self._n_recent = self._n_refused_recent = 0
         self._is_reported = True
@@ -83,7 +61,8 @@ class InputTask:
         self._is_reported = False
         self._n_recent += 1
         self._last_arrival = now
-        self._arrivals.count(now)
+        self._n_arrived += 1
+        self._arrivals.append(now)
         self._stamp, self._frame = seconds_of(cloud.header.stamp), cloud.header.frame_id
         self._fields = ' '.join(field.name for field in cloud.fields)
 
@@ -103,13 +82,18 @@ class InputTask:
         self._is_reported = True
         if self._source.idle:
             self._listening_since = now
-        n_events, span, rate = self._arrivals.window(now)
+        while self._arrivals and now - self._arrivals[0] > RATE_WINDOW:
+            self._arrivals.popleft()
+        n_events = len(self._arrivals)
+        span = self._arrivals[-1] - self._arrivals[0] if n_events else 0.0
+        # The first event opens the span over which the others are counted.
+        rate = (n_events - 1) / span if span > 0.0 else None
         age = None if self._stamp is None else ros_time - self._stamp
         values = {
             'Topic': self._source.topic,
             'Publishers': str(self._source.n_publishers),
             'QoS': self._source.qos_words,
-            'Events since startup': str(self._arrivals.n_total),
+            'Events since startup': str(self._n_arrived),
             'Events in window': str(n_events),
             'Duration of window (s)': f'{span:.3f}',
             'Actual frequency (Hz)': _digits(rate, '.2f'),

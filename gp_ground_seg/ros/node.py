@@ -204,11 +204,6 @@ class GroundSegmentationNode(ConfiguredNode):
             self._frames = FrameListener(self, config, self._on_cloud)
         self._input.callback = self._frames.hold if self._frames else self._on_cloud
 
-    @property
-    def is_compiling(self) -> bool:
-        """Whether the compiled backend is being made, in a thread of this process."""
-        return self._loader.is_busy
-
     def destroy_node(self) -> None:
         """Free what the node holds."""
         self._loader.stop()
@@ -376,7 +371,7 @@ def main(args: Sequence[str] | None = None, *, is_managed: bool = False) -> int:
             if node is not None:
                 node.destroy_node()
             rclpy.try_shutdown()
-    if node is not None and node.is_compiling:
+    if node is not None and node._loader.is_busy:
         # The end of the interpreter would wait for LLVM, for ten seconds and more.
         os._exit(0)
     return 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from copy import copy
 from typing import Any, NamedTuple
 
@@ -52,30 +52,20 @@ class Output(NamedTuple):
     is_optional: bool  # built only while it has a subscriber
 
 
-def labelled_names(taken: Iterable[str]) -> dict[str, str]:
-    """Return a free name for each of `LABELLED_FIELDS`: with ``gp_`` where it is `taken`."""
-    used, names = set(taken), {}
-    for field in LABELLED_FIELDS:
-        name = field
-        while name in used:
-            name = f'gp_{name}'
-        used.add(name)
-        names[field] = name
-    return names
-
-
 def labelled_cloud(segmented: SegmentedCloud) -> PointCloud2:
-    """Return the cloud with `LABELLED_FIELDS` added to every point.
+    """Return the cloud with `LABELLED_FIELDS` added to every point, with ``gp_`` if in use.
 
     Header, order, shape and every byte of every point are the input's; padding of the rows is
     left out. ``is_dense`` tells whether the coordinates and all added values are finite.
     """
     cloud, columns = segmented.cloud, {}
-    for field, name in labelled_names(field.name for field in cloud.fields).items():
-        columns[name] = getattr(segmented.segmentation, field)
-        if field != 'label':
-            with np.errstate(over='ignore'):
-                columns[name] = columns[name].astype(np.float32, copy=False)
+    for field in LABELLED_FIELDS:
+        name = field
+        while name in columns or any(name == other.name for other in cloud.fields):
+            name = f'gp_{name}'
+        values = getattr(segmented.segmentation, field)
+        with np.errstate(over='ignore'):
+            columns[name] = values if field == 'label' else values.astype(np.float32, copy=False)
     placed, step, data = append_columns(cloud, columns)
     message = copy(cloud)
     message.fields = [
