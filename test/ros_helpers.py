@@ -391,21 +391,22 @@ def bench(values=None, settled=True):
 
 
 @contextlib.contextmanager
-def linked(sends=RELIABLE):
-    """A connected `Link` to a node of another process."""
+def linked(sends=RELIABLE, connected=True):
+    """A `Link` to a node of another process, connected unless that does not listen yet."""
     with isolated_context() as context:
         link = Link(context, sends)
         with spinning(context, link.probe):
-            link.wait_until_connected()
+            if connected:
+                link.wait_until_connected()
             yield link
 
 
 @contextlib.contextmanager
-def linked_process(folder, values, **options):
+def linked_process(folder, values, connected=True, **options):
     """A `Process` in our namespace, and a `Link` to it."""
     with Process(*IN_NAMESPACE, *given(values), folder=folder, **options) as node:
         node.wait_until_ready()
-        with linked() as link:
+        with linked(connected=connected) as link:
             yield node, link
 
 
