@@ -35,7 +35,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from gp_ground_seg.core.backend import choose_backend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.ros.loader import CHANGED, FOLLOWS
-from gp_ground_seg.ros.node import GroundSegmentationNode, main
+from gp_ground_seg.ros.node import GroundSegmentationNode
 
 # Other tests run beside this one, also as workers of pytest-xdist; nothing of them must be heard.
 _WORKER = os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw')
@@ -114,7 +114,7 @@ POINT = np.dtype({**_LAYOUT, 'itemsize': 64})
 """A point as a driver sends it: x not first, bytes that belong to no field."""
 
 
-def street(n_points, seed=0, n_invalid=0):
+def street(n_points, seed=0):
     """Level ground 1.73 m below the sensor with walls and poles on it, as structured points."""
     rng = np.random.default_rng(seed)
     points = np.zeros(n_points, POINT)
@@ -126,8 +126,6 @@ def street(n_points, seed=0, n_invalid=0):
     radius[is_wall] = rng.choice([8.0, 15.0, 25.0], is_wall.sum())
     z[is_wall] = rng.uniform(-1.0, 1.0, is_wall.sum())
     points['x'], points['y'], points['z'] = radius * np.cos(azimuth), radius * np.sin(azimuth), z
-    invalid = rng.choice(n_points, n_invalid, replace=False)
-    points['z'][invalid] = rng.choice([np.nan, np.inf, -np.inf], n_invalid)
     return points
 
 
@@ -166,8 +164,9 @@ def rows_of(message):
     return [data[start : start + step] for start in range(0, len(data), step)]
 
 
-ENTRY_POINT = ('-c', 'import sys; from gp_ground_seg.cli.node import main; sys.exit(main())')
-"""What the installed executable does."""
+_RUN = "import sys; sys.path.remove(''); from gp_ground_seg.cli.node import {0}; sys.exit({0}())"
+ENTRY_POINT, MANAGED = (('-c', _RUN.format(name)) for name in ('main', 'main_managed'))
+"""What the installed executables do; the first of sys.path is their folder."""
 MODULE = ('-m', 'gp_ground_seg', 'node')
 IN_NAMESPACE = ('--ros-args', '-r', f'__ns:={NAMESPACE}')
 
@@ -417,13 +416,3 @@ def started_node(*words):
         node = GroundSegmentationNode(context=context, cli_args=['--ros-args', *words])
         with spinning(context, node):
             yield node
-
-
-def start_error(capfd, *words):
-    """Line that the node ends with when it refuses to start with ``--ros-args words``."""
-    assert main(['--ros-args', *words]) == 2
-    said = capfd.readouterr()
-    assert said.out == '' and 'Traceback' not in said.err
-    line = said.err.splitlines()[-1]
-    assert line.startswith('ground_segmentation_node: error: ')
-    return line

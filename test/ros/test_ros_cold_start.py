@@ -17,11 +17,6 @@ from gp_ground_seg.ros.loader import CHANGED, FOLLOWS, STAYS, BackendLoader
 pytestmark = pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
 
 FIXED = {'learning.mode': 'fixed'}
-# As the installed executable, the folder of which is the first of sys.path.
-SAFE_START = (
-    '-c', "import sys; sys.path.remove(''); from gp_ground_seg.cli.node import main; "
-    'sys.exit(main())',
-)  # fmt: skip
 
 
 @pytest.mark.slow
@@ -33,7 +28,7 @@ def test_node_segments_while_its_code_is_compiled_and_then_changes_over(monkeypa
     # Never from the current folder: this would end the compiler, or the node.
     (tmp_path / 'numpy.py').write_text('raise SystemExit(3)')
     monkeypatch.chdir(tmp_path)
-    with ros.linked_process(tmp_path, FIXED, start=SAFE_START) as (node, link):
+    with ros.linked_process(tmp_path, FIXED) as (node, link):
         link.segment(message)
         assert FOLLOWS in node.log
         assert CHANGED not in node.log
@@ -44,9 +39,7 @@ def test_node_segments_while_its_code_is_compiled_and_then_changes_over(monkeypa
         assert STAYS not in node.log
         assert node.stop(signal.SIGINT)[0] == 0
     # All of it is there for the next start.
-    with ros.Process(
-        *ros.IN_NAMESPACE, *ros.given(FIXED), folder=tmp_path, start=SAFE_START
-    ) as node:
+    with ros.Process(*ros.IN_NAMESPACE, *ros.given(FIXED), folder=tmp_path) as node:
         node.wait_until_settled()
         assert 'compiling' not in node.log
 

@@ -19,16 +19,15 @@ from gp_ground_seg.ros.loader import FOLLOWS
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
-START = (
-    '-c', 'import sys; from gp_ground_seg.cli.node import main_managed; sys.exit(main_managed())',
-)  # fmt: skip
-
 
 @pytest.fixture
 def managed(tmp_path):
     """The process of a node, and a `Link` to it; it ends without an error."""
     limits = {'diagnostics.stale_after': 0.5}
-    with ros.linked_process(tmp_path, limits, connected=False, start=START) as (process, link):
+    with ros.linked_process(tmp_path, limits, connected=False, start=ros.MANAGED) as (
+        process,
+        link,
+    ):
         yield process, link
         assert process.stop(signal.SIGINT)[0] == 0
         assert 'Traceback' not in process.log and 'ERROR' not in process.log

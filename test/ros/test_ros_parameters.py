@@ -7,7 +7,6 @@ import pytest
 import ros_helpers as ros
 import yaml
 from config_samples import configs
-from conftest import REPOSITORY
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rcl_interfaces import srv
@@ -223,15 +222,6 @@ def test_any_configuration_can_be_loaded_over_any_other_in_any_order(shared, con
     assert shared.node.config == config
 
 
-def started_with(path):
-    """Parameters of a node that is started with a file."""
-    namespace, name = ros.NAMESPACE, ros.NODE_NAME
-    words = '-r', f'__ns:={namespace}', '-r', f'__node:={name}', '--params-file', str(path)
-    with ros.started_node(*words) as node:
-        assert not node._input._is_pinned  # it follows the publishers, as without a file
-        return node.config
-
-
 @pytest.mark.parametrize('height', [1.2, 'auto'])
 def test_what_is_dumped_is_what_runs_and_can_be_given_at_start(b, tmp_path, height):
     config = Config().replace(**{'sensor.height': height, 'grid.n_segments': 120})
@@ -240,12 +230,10 @@ def test_what_is_dumped_is_what_runs_and_can_be_given_at_start(b, tmp_path, heig
     path.write_text(yaml.safe_dump(dump(b)))
     # Our own tools read it, use_sim_time, qos_overrides and all.
     assert Config.problems_of_file(path) == []
-    assert Config.from_yaml(path) == started_with(path) == config
-
-
-@pytest.mark.parametrize('name', PRESETS)
-def test_node_starts_with_every_shipped_file(name):
-    assert started_with(REPOSITORY / 'config' / f'{name}.yaml') == PRESETS[name].config
+    words = *ros.IN_NAMESPACE[1:], '-r', f'__node:={ros.NODE_NAME}', '--params-file', str(path)
+    with ros.started_node(*words) as node:
+        assert not node._input._is_pinned  # it follows the publishers, as without a file
+        assert Config.from_yaml(path) == node.config == config
 
 
 def test_changes_during_playback_lose_no_frame(b):
@@ -290,17 +278,11 @@ def test_unknown_names_are_reported_and_not_declared(tmp_path):
     assert 'ros2 param dump /ground_segmentation_node' in log
 
 
-def test_a_start_with_the_defaults_is_one_line_about_them(tmp_path):
-    with ros.stderr_in(tmp_path) as stderr, ros.started_node():
-        log = ros.said_by(stderr, 'listening to')
-    assert 'parameters: all defaults (all values by ros2 param dump' in log
-    assert '(default' not in log
-    assert len(log.splitlines()) <= 4
-
-
-@pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
-def test_a_given_height_is_not_doubted_before_the_first_cloud(tmp_path):
-    height = ros.given({'sensor.height': 4.5})
-    with ros.stderr_in(tmp_path) as stderr, ros.started_node(*height):
-        log = ros.said_by(stderr, CHANGED, 'sensor.height: 4.5 m')
-    assert 'is sensor.height right' not in log
+@pytest.mark.parametrize('height', ['auto', 4.5])
+def test_a_start_says_little_and_doubts_no_given_height_before_the_first_cloud(tmp_path, height):
+    words = ros.given({'sensor.height': height, 'diagnostics.period': 1.0})
+    with ros.stderr_in(tmp_path) as stderr, ros.started_node(*words):
+        log = ros.said_by(stderr, 'listening to', *[CHANGED] * HAVE_NUMBA)
+    assert ('parameters: all defaults (all values by ros2 param dump' in log) == (height == 'auto')
+    assert ('  sensor.height: 4.5 m  (default auto)\n' in log) == (height == 4.5)
+    assert log.count('(default') == (height == 4.5) and len(log.splitlines()) <= 5

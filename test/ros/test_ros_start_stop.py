@@ -15,6 +15,7 @@ from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.ros.arguments import unused_files
+from gp_ground_seg.ros.node import main
 from gp_ground_seg.ros.session import ROS_WHEELS, ros_session, stop_on_signals
 
 FIXED = (*IN_NAMESPACE, *ros.given({'learning.mode': 'fixed'}))
@@ -65,20 +66,21 @@ if importlib.util.find_spec('tf2_ros') is None:
     )
 
 
-@pytest.mark.parametrize('text', FILES)
-def test_bad_file(tmp_path, capfd, text):
-    path = tmp_path / 'b\x1b[2Ja\nd.yaml'
-    path.write_bytes(text.encode('latin-1'))
-    line = ros.start_error(capfd, '--params-file', str(path))
-    assert FILES[text] in line and line.isprintable()
-
-
-@pytest.mark.parametrize('words', WORDS)
-def test_bad_words(monkeypatch, capfd, words):
-    if words.startswith('ROS_'):
-        monkeypatch.setenv(*words.split('='))
-    line = ros.start_error(capfd, *[word for word in words.split() if word[:4] != 'ROS_'])
-    assert WORDS[words] in line and '.c:' not in line
+@pytest.mark.parametrize('given', [*FILES, *WORDS])
+def test_what_is_refused_is_said_in_one_line(tmp_path, monkeypatch, capfd, given):
+    if given.startswith('ROS_'):
+        monkeypatch.setenv(*given.split('='))
+    words = [word for word in given.split() if word[:4] != 'ROS_']
+    if given in FILES:
+        path = tmp_path / 'b\x1b[2Ja\nd.yaml'
+        path.write_bytes(given.encode('latin-1'))
+        words = ['--params-file', str(path)]
+    assert main(['--ros-args', *words]) == 2
+    said = capfd.readouterr()
+    line = said.err.splitlines()[-1]
+    assert said.out == '' and 'Traceback' not in said.err
+    assert line.startswith('ground_segmentation_node: error: ')
+    assert {**FILES, **WORDS}[given] in line and line.isprintable() and '.c:' not in line
 
 
 @pytest.mark.parametrize('words', ['node nonsense', 'node --ros-args -- nonsense'])
