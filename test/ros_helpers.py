@@ -225,25 +225,24 @@ class Process:
 
 @contextlib.contextmanager
 def stderr_in(folder):
-    """File of what this process writes to stderr meanwhile; shown after it.
+    """A function that returns what this process writes to stderr meanwhile, once it has all texts.
 
     A look at what capfd has empties it, and loses the line that a thread writes just then.
     """
     path, kept = folder / 'stderr', os.dup(2)
+
+    def said(*texts):
+        wait_for(lambda: all(text in path.read_text() for text in texts), f'{texts} on stderr')
+        return path.read_text()
+
     try:
         with path.open('a') as file:
             os.dup2(file.fileno(), 2)
-        yield path
+        yield said
     finally:
         os.dup2(kept, 2)
         os.close(kept)
         sys.stderr.write(path.read_text())
-
-
-def said_by(stderr, *texts):
-    """What is in the file `stderr`, once that holds all `texts`."""
-    wait_for(lambda: all(text in stderr.read_text() for text in texts), f'{texts} on stderr')
-    return stderr.read_text()
 
 
 def values_of(status):

@@ -76,8 +76,8 @@ def test_numpy_asked_for_meanwhile_stays_and_the_newest_parameters_hold(held_bac
 def test_a_failure_is_a_warning_and_the_node_goes_on(monkeypatch, tmp_path):
     monkeypatch.setattr(jit, 'is_code_kept', lambda: False)
     monkeypatch.setattr(loader, '_COMPILE', "raise OSError('no space left')")
-    with ros.stderr_in(tmp_path) as stderr, ros.bench(settled=False) as b:
-        assert 'OSError: no space left' in ros.said_by(stderr, STAYS)
+    with ros.stderr_in(tmp_path) as said, ros.bench(settled=False) as b:
+        assert 'OSError: no space left' in said(STAYS)
         b.segment(to_message(street(1000)))
         assert b.node._segmenter.backend.name == 'numpy'
 

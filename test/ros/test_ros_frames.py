@@ -1,5 +1,6 @@
 """Tilt of the sensor by TF, and what of it is seen outside: nothing but better labels."""
 
+import contextlib
 import dataclasses
 import importlib.util
 import math
@@ -214,31 +215,28 @@ def test_the_crop_box_is_in_the_base_of_tf(tf):
     assert found == sorted(row for row, is_body in zip(rows, inside, strict=True) if not is_body)
 
 
-class ImuProbe:
-    """Sends orientations to a node."""
+@contextlib.contextmanager
+def bench_with_imu():
+    """A node that takes the tilt of an IMU, and a function that sends an orientation to it."""
+    with bench({**VALUES, 'frame.level': 'imu'}) as b:
+        publisher = b.probe.create_publisher(Imu, 'imu', ros.BEST_EFFORT)
+        wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription of imu')
 
-    def __init__(self, bench):
-        self.bench = bench
-        self.publisher = bench.probe.create_publisher(Imu, 'imu', ros.BEST_EFFORT)
-        wait_for(lambda: self.publisher.get_subscription_count() == 1, 'subscription of imu')
+        def say(matrix, stamp, frame='tilted_lidar', covariance=0.01):
+            n_before = len(b.node._frames._imu._messages)
+            message = Imu(orientation=quaternion(matrix))
+            message.header.stamp.sec, message.header.stamp.nanosec = stamp
+            message.header.frame_id = frame
+            message.orientation_covariance[0] = covariance
+            publisher.publish(message)
+            wait_for(lambda: len(b.node._frames._imu._messages) > n_before, 'orientation')
 
-    def say(self, matrix, stamp, frame='tilted_lidar', covariance=0.01):
-        n_before = len(self.bench.node._frames._imu._messages)
-        message = Imu(orientation=quaternion(matrix))
-        message.header.stamp.sec, message.header.stamp.nanosec = stamp
-        message.header.frame_id = frame
-        message.orientation_covariance[0] = covariance
-        self.publisher.publish(message)
-        wait_for(lambda: len(self.bench.node._frames._imu._messages) > n_before, 'orientation')
-
-
-BY_IMU = {**VALUES, 'frame.level': 'imu'}
+        yield b, say
 
 
 def test_tilt_by_an_imu(monkeypatch):
     points, turn = turned_street()
-    with bench(BY_IMU) as b:
-        imu = ImuProbe(b)
+    with bench_with_imu() as (b, say):
 
         def check_refused(reason, seconds, nanosec=0):
             b.publisher.publish(cloud_of(points, seconds, nanosec))
@@ -250,23 +248,23 @@ def test_tilt_by_an_imu(monkeypatch):
         message = cloud_of(points, 3, 10_000_000)
         b.publisher.publish(message)
         wait_for(lambda: len(b.node._frames._waiting) == 1, 'cloud that waits')
-        imu.say(np.eye(3), (3, 0))
+        say(np.eye(3), (3, 0))
         time.sleep(5 * transforms.REVIEW_PERIOD)
         assert len(b.node._frames._waiting) == 1
         for nanosec, matrix in ((9_000_000, turn), (12_000_000, np.eye(3))):
-            imu.say(matrix, (3, nanosec))
+            say(matrix, (3, nanosec))
         check_levelled(points, message, (b.ground.wait(1)[0], b.obstacles.wait(1)[0]))
         # Refused: far from it in time, without an orientation, in a frame that is not known.
         monkeypatch.setattr(transforms, 'MAX_WAIT', 0.1)
         check_refused('is 0.058 s from its stamp: must be within 0.05 s', 3, 70_000_000)
-        imu.say(turn, (5, 0), covariance=-1.0)
+        say(turn, (5, 0), covariance=-1.0)
         check_refused('orientation_covariance[0] is -1', 5)
-        imu.say(turn, (6, 0), frame='imu_link')
+        say(turn, (6, 0), frame='imu_link')
         unknown = 'to that of /test_' if HAS_TF2 else 'needs tf2_ros (sudo apt install'
         check_refused(unknown, 6)
         assert len(b.ground.messages) == 1
         assert b.set('frame.level', 'sensor').successful
-        wait_for(lambda: imu.publisher.get_subscription_count() == 0, 'end of the subscription')
+        wait_for(lambda: not b.probe.count_subscribers('imu'), 'end of the subscription')
         assert len(b.segment(cloud_of(points, 7))) == 2
 
 
@@ -274,8 +272,8 @@ def test_tilt_by_an_imu_in_another_frame(tf):
     points, turn = turned_street()
     tf.known['imu_link', 'tilted_lidar'] = mount = rotation(-1.2, 0.7)
     message = cloud_of(points, 3)
-    with bench(BY_IMU) as b:
-        ImuProbe(b).say(turn @ mount.T, (3, 20_000_000), 'imu_link')
+    with bench_with_imu() as (b, say):
+        say(turn @ mount.T, (3, 20_000_000), 'imu_link')
         check_levelled(points, message, b.segment(message))
 
 

@@ -85,7 +85,7 @@ def n_ground(points, config):
 
 
 def test_a_change_takes_effect_with_the_next_cloud(b, tmp_path):
-    with ros.stderr_in(tmp_path) as stderr:
+    with ros.stderr_in(tmp_path) as said:
         points = street(5000)
         message = to_message(points)
         assert b.segment(message)[0].width == n_ground(points, Config())
@@ -97,7 +97,7 @@ def test_a_change_takes_effect_with_the_next_cloud(b, tmp_path):
             before = b.node.config
             assert b.set(name, value).successful
             assert b.node.config == before.replace(**{name: value})
-            ros.said_by(stderr, f'{name}: {before[name]} -> {value}\n')
+            said(f'{name}: {before[name]} -> {value}\n')
             assert b.segment(message)[0].width == n_ground(points, b.node.config)
         narrow = Config().replace(**{'label.ground_tolerance': 0.01})
         assert n_ground(points, Config()) != n_ground(points, narrow)
@@ -262,7 +262,7 @@ def test_unknown_names_are_reported_and_not_declared(tmp_path):
         'grid.r_max': 50,
         'label.ground_tolerance': 1,
     }
-    with ros.stderr_in(tmp_path) as stderr, ros.started_node(*ros.given(words)) as node:
+    with ros.stderr_in(tmp_path) as said, ros.started_node(*ros.given(words)) as node:
         changes = {'sensor.height': 2.5, 'grid.r_max': 50.0, 'label.ground_tolerance': 1.0}
         changes['diagnostics.period'] = 0.1
         assert node.config == Config().replace(**changes)
@@ -270,7 +270,7 @@ def test_unknown_names_are_reported_and_not_declared(tmp_path):
             assert node.get_parameter(name).type_ == Parameter.Type.DOUBLE
             assert node.get_parameter(name).value == value
         assert not node.has_parameter('lable.ground_tolerance')
-        log = ros.said_by(stderr, 'did you mean label.ground_tolerance?', '/nowhere')
+        log = said('did you mean label.ground_tolerance?', '/nowhere')
     assert log.count('is not used') == 2
     shown = [line for line in log.splitlines() if '  (default ' in line]
     assert '  sensor.height: 2.5 m  (default auto)' in shown
@@ -281,8 +281,8 @@ def test_unknown_names_are_reported_and_not_declared(tmp_path):
 @pytest.mark.parametrize('height', ['auto', 4.5])
 def test_a_start_says_little_and_doubts_no_given_height_before_the_first_cloud(tmp_path, height):
     words = ros.given({'sensor.height': height, 'diagnostics.period': 1.0})
-    with ros.stderr_in(tmp_path) as stderr, ros.started_node(*words):
-        log = ros.said_by(stderr, 'listening to', *[CHANGED] * HAVE_NUMBA)
+    with ros.stderr_in(tmp_path) as said, ros.started_node(*words):
+        log = said('listening to', *[CHANGED] * HAVE_NUMBA)
     assert ('parameters: all defaults (all values by ros2 param dump' in log) == (height == 'auto')
     assert ('  sensor.height: 4.5 m  (default auto)\n' in log) == (height == 4.5)
     assert log.count('(default') == (height == 4.5) and len(log.splitlines()) <= 5
