@@ -18,7 +18,7 @@ PAGE = (REPOSITORY / 'docs' / 'node.md').read_text(encoding='utf-8')
 
 @pytest.fixture
 def launched():
-    """Log of ``ros2 launch``, interrupted once a node has had time to start."""
+    """Log of ``ros2 launch``, interrupted once a node has had time to start; CI starts one too."""
     pytest.importorskip('launch_ros', reason='launch_ros is not installed')
     packages = pytest.importorskip('ament_index_python.packages')
     try:
@@ -34,20 +34,17 @@ def launched():
     return launch
 
 
-def test_launch_starts_the_node_and_the_two_of_the_page(launched, tmp_path):
-    for name, height in ('front', 1.2), ('rear', 0.6):
-        text = f'/**: {{ros__parameters: {{sensor: {{height: {height}}}}}}}\n'
-        (tmp_path / f'{name}.yaml').write_text(text)
-    words = 'topic:=/lidar', 'namespace:=front', f'params_file:={tmp_path}/front.yaml'
-    log = launched('gp_ground_seg', FILE, *words)
-    for line in 'sensor.height: 1.2 m', 'listening to /lidar', 'front.ground_segmentation_node':
-        assert line in log
+def test_launch_starts_the_two_nodes_of_the_page(launched, tmp_path):
     path = tmp_path / 'two.launch.py'
     path.write_text(EXAMPLE.replace('/etc/robot', str(tmp_path)))
+    places = {'front': 1.2, 'rear': 0.6}
+    for name, height in places.items():
+        text = f'/**: {{ros__parameters: {{sensor: {{height: {height}}}}}}}\n'
+        (tmp_path / f'{name}.yaml').write_text(text)
     log = launched(path)
-    for name in 'front', 'rear':
-        assert f'listening to /lidar_{name}/points' in log
-    assert 'sensor.height: 0.6 m' in log
+    for name, height in places.items():
+        assert f'[{name}.ground_segmentation_node]: listening to /lidar_{name}/points' in log
+        assert f'sensor.height: {height} m' in log
     assert '/no/such.yaml' in launched('gp_ground_seg', FILE, 'params_file:=/no/such.yaml')
 
 
