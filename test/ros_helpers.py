@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -167,6 +168,8 @@ def rows_of(message):
 _RUN = "import sys; sys.path.remove(''); from gp_ground_seg.cli.node import {0}; sys.exit({0}())"
 ENTRY_POINT, MANAGED = (('-c', _RUN.format(name)) for name in ('main', 'main_managed'))
 """What the installed executables do; the first of sys.path is their folder."""
+SOON = 4.0
+"""Time of the cloud at hand, and what a machine that does other things adds to it [s]."""
 MODULE = ('-m', 'gp_ground_seg', 'node')
 IN_NAMESPACE = ('--ros-args', '-r', f'__ns:={NAMESPACE}')
 
@@ -210,6 +213,12 @@ class Process:
         self.popen.send_signal(number)
         code = self.popen.wait(PATIENCE)
         return code, time.monotonic() - start
+
+    def end_well(self, number=signal.SIGINT):
+        """Send a signal, at which a node ends soon, with the cloud at hand, and says nothing."""
+        code, seconds = self.stop(number)
+        assert code == 0 and seconds < SOON, self.log
+        assert 'Traceback' not in self.log and 'ERROR' not in self.log
 
     def __enter__(self):
         return self
@@ -289,13 +298,9 @@ class Link:
         wait_for(lambda: self.publisher.publish(message) or condition(), what)
 
     def set(self, name, value):
-        """Result of ``ros2 param set``."""
-        return self.load({name: value})[0]
-
-    def refusal(self, name, value):
-        """Reason for which a value is refused."""
-        result = self.set(name, value)
-        assert not result.successful
+        """Reason for which ``ros2 param set`` is refused; empty if it is not."""
+        (result,) = self.load({name: value})
+        assert result.successful != bool(result.reason)
         return result.reason
 
     def load(self, values):

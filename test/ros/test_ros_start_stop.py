@@ -19,8 +19,6 @@ from gp_ground_seg.ros.node import main
 from gp_ground_seg.ros.session import ROS_WHEELS, ros_session, stop_on_signals
 
 FIXED = (*IN_NAMESPACE, *ros.given({'learning.mode': 'fixed'}))
-SOON = 4.0
-"""Time of the cloud at hand, and what a machine that does other things adds to it [s]."""
 QOS = 'qos_overrides./points.subscription'
 HEAD = '/**:\n  ros__parameters:\n'
 
@@ -170,20 +168,13 @@ def heeds_sigterm(process):
     return bool(int(caught.split()[1], 16) >> (signal.SIGTERM - 1) & 1)
 
 
-def assert_good_end(node, number):
-    code, duration = node.stop(number)
-    assert code == 0, node.log
-    assert duration < SOON
-    assert 'Traceback' not in node.log and 'ERROR' not in node.log
-
-
 @pytest.mark.parametrize(
     ('start', 'number'), [(ros.ENTRY_POINT, signal.SIGINT), (MODULE, signal.SIGTERM)]
 )
 def test_while_importing(tmp_path, start, number):
     with Process(*FIXED, folder=tmp_path, start=start) as node:
         wait_for(lambda: heeds_sigterm(node), 'handler')
-        assert_good_end(node, number)
+        node.end_well(number)
         assert 'listening' not in node.log
 
 
@@ -210,10 +201,7 @@ def test_while_compiling(tmp_path, mode, number):
             node.wait_until_ready('others can write')
         before = cpu_seconds(worker)
         wait_for(lambda: cpu_seconds(worker) > before + 2.0, 'work')
-        if number == signal.SIGTERM:
-            assert_good_end(node, number)
-        else:
-            node.stop(number)
+        (node.end_well if number == signal.SIGTERM else node.stop)(number)
     wait_for(lambda: not is_running(worker), 'end of the compiler')
 
 
@@ -228,7 +216,7 @@ def test_under_load(tmp_path):
         # A terminal and a launch file both send one.
         for _ in range(2):
             node.popen.send_signal(signal.SIGINT)
-        assert_good_end(node, signal.SIGTERM)
+        node.end_well(signal.SIGTERM)
         assert len(link.ground.messages) < 6
 
 
@@ -248,7 +236,7 @@ def test_sigint_that_was_ignored_at_the_start_ends_the_player_and_the_node(tmp_p
             link.ground.wait(4)
             assert player.stop(signal.SIGINT)[0] == 130
             assert player.log.splitlines()[-1] == 'gp-ground-seg: interrupted'
-        assert_good_end(node, signal.SIGINT)
+        node.end_well(signal.SIGINT)
 
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
