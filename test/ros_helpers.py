@@ -322,6 +322,16 @@ class Link:
         wait_for(future.done, f'answer of {name}')
         return future.result()
 
+    def forget(self, collector):
+        """End what `collector` listens to."""
+        self.in_executor(self.probe.destroy_subscription, collector.subscription)
+
+    def in_executor(self, function, *arguments):
+        """Result of a call made between two waits, where entities may safely go."""
+        task = self.probe.executor.create_task(function, *arguments)
+        wait_for(task.done, 'turn of the executor')
+        return task.result()
+
     def wait_for_status(self, task, is_wanted):
         """Return the first status of the node's `task`, from now on, that is wanted.
 
@@ -369,16 +379,6 @@ class Bench(Link):
         assert all(result.successful for result in self.load(values))
         yield
         self.load(before)
-
-    def forget(self, collector):
-        """End what `collector` listens to."""
-        self.in_executor(self.probe.destroy_subscription, collector.subscription)
-
-    def in_executor(self, function, *arguments):
-        """Result of a call made between two waits, where entities may safely go."""
-        task = self.node.executor.create_task(function, *arguments)
-        wait_for(task.done, 'turn of the executor')
-        return task.result()
 
 
 @contextlib.contextmanager
