@@ -4,13 +4,17 @@ import importlib
 import re
 import subprocess
 import sys
-from types import ModuleType
+from unittest.mock import MagicMock
 
 import pytest
 from conftest import REPOSITORY, load_script
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
+MODULES = (
+    'ament_index_python.packages', 'launch', 'launch.actions', 'launch.conditions',
+    'launch.substitutions', 'launch_ros.actions',
+)  # fmt: skip
 FILE = 'ground_segmentation.launch.py'
 PAGE = (REPOSITORY / 'docs' / 'node.md').read_text(encoding='utf-8')
 (EXAMPLE,) = re.findall(r'```python\n(from launch import .*?)```', PAGE, re.DOTALL)
@@ -48,42 +52,22 @@ def test_launch_starts_the_two_nodes_of_the_page(launched, tmp_path):
     assert '/no/such.yaml' in launched('gp_ground_seg', FILE, 'params_file:=/no/such.yaml')
 
 
-STAND_IN = {
-    'launch': ['LaunchDescription'],
-    'launch.actions': ['DeclareLaunchArgument'],
-    'launch.conditions': ['IfCondition'],
-    'launch.substitutions': ['LaunchConfiguration'],
-    'launch_ros.actions': ['Node'],
-}
-
-
-class Recorded:
-    def __init__(self, *args, **options):
-        self.args, self.options = args, options
-
-
-def test_the_page_the_file_and_the_node_have_the_same_names(monkeypatch, tmp_path):
+def test_the_page_the_file_and_the_node_have_the_same_names(monkeypatch):
     pytest.importorskip('ros_helpers', reason='ROS is not installed')
     outputs = importlib.import_module('gp_ground_seg.ros.outputs').OUTPUTS
-    index = tmp_path / 'share' / 'ament_index' / 'resource_index' / 'packages'
-    index.mkdir(parents=True)
-    (index / 'gp_ground_seg').touch()
-    (tmp_path / 'share' / 'gp_ground_seg').symlink_to(REPOSITORY)
-    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
-    for module, names in STAND_IN.items():
-        monkeypatch.setitem(sys.modules, module, ModuleType(module))
-        for name in names:
-            setattr(sys.modules[module], name, type(name, (Recorded,), {}))
+    for module in MODULES:
+        monkeypatch.setitem(sys.modules, module, MagicMock())
+    sys.modules[MODULES[0]].get_package_share_directory = lambda _: REPOSITORY
     script = load_script(f'launch/{FILE}')
+    script.generate_launch_description()
+    rviz, node = (call.kwargs for call in script.Node.call_args_list)
 
     shown = re.findall(r'^\| `(\w+)` \| (?:`([^`]*)`)? ?\| ', PAGE, re.MULTILINE)
     default = str(script.CONFIG / 'default.yaml')
     declared = [(name, value.replace(default, '')) for name, value, _ in script.ARGUMENTS]
     assert shown == declared
-    (actions,) = script.generate_launch_description().args
     used = re.findall(r"given\['(\w+)'\]", (REPOSITORY / 'launch' / FILE).read_text())
     assert set(used) == set(dict(shown))
-    rviz, node = (action.options for action in actions[-2:])
     names = [output.topic.replace('~', node['name']) for output in outputs]
     assert rviz['remappings'] == [(f'/{name}', name) for name in names]
     assert [topic for topic, _ in node['remappings']] == ['points']
