@@ -225,11 +225,10 @@ class Process:
 
     def __exit__(self, *_error):
         self.popen.terminate()
-        try:
+        with contextlib.suppress(subprocess.TimeoutExpired):
             self.popen.wait(10.0)
-        except subprocess.TimeoutExpired:
-            self.popen.kill()
-            self.popen.wait()
+        self.popen.kill()  # does nothing to a process that has ended
+        self.popen.wait()
 
 
 @contextlib.contextmanager
