@@ -290,10 +290,13 @@ class Diagnostics:
             # Raised from a timer, it would end the node.
             statuses = [Status('diagnostics', Level.ERROR, f'{type(error).__name__}: {error}', {})]
         for status in statuses:
-            message = DiagnosticStatus(level=bytes([status.level]), message=status.message)
-            message.name = f'{node_name.lstrip("/")}: {status.task}'
-            message.hardware_id = node_name
-            message.values = [KeyValue(key=k, value=v) for k, v in status.values.items()]
+            message = DiagnosticStatus(
+                level=bytes([status.level]),
+                name=f'{node_name.lstrip("/")}: {status.task}',
+                message=status.message,
+                hardware_id=node_name,
+                values=[KeyValue(key=k, value=v) for k, v in status.values.items()],
+            )
             array.status.append(message)
         self._publisher.publish(array)
 

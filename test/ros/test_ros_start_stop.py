@@ -201,7 +201,10 @@ def test_while_compiling(tmp_path, mode, number):
             node.wait_until_ready('others can write')
         before = cpu_seconds(worker)
         wait_for(lambda: cpu_seconds(worker) > before + 2.0, 'work')
-        (node.end_well if number == signal.SIGTERM else node.stop)(number)
+        if number == signal.SIGKILL:
+            node.popen.kill()
+        else:
+            node.end_well(number)
     wait_for(lambda: not is_running(worker), 'end of the compiler')
 
 
