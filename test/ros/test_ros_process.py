@@ -1,7 +1,6 @@
 """The node, drivers and players, each a process: what comes back, what diagnostics say."""
 
 import signal
-import sys
 import time
 from pathlib import Path
 
@@ -243,13 +242,10 @@ while True:
 @pytest.mark.slow
 def test_best_effort_driver_with_the_large_segment_profile(node, tmp_path):
     profile = str(REPOSITORY / 'config' / 'fastdds_large_clouds.xml')
-    options = {
-        'command': [sys.executable, '-c', DRIVER],
-        'FASTRTPS_DEFAULT_PROFILES_FILE': profile,
-    }
-    with ros.linked(sends=None) as link, ros.Process(folder=tmp_path, **options) as driver:
+    driver = {'start': ('-c', DRIVER), 'FASTRTPS_DEFAULT_PROFILES_FILE': profile}
+    with ros.linked(sends=None) as link, ros.Process(folder=tmp_path, **driver) as process:
         link.ground.wait(5)
-        assert driver.popen.poll() is None
+        assert process.popen.poll() is None
         # Fast DDS only warns about a profile that it cannot read, and goes on without.
-        assert 'XML' not in driver.log
+        assert 'XML' not in process.log
     assert 'points (best_effort' in node.log
