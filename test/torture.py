@@ -377,7 +377,7 @@ def test_readers(numbers, tmp_path):
 @cases(400, 200)
 @pytest.mark.filterwarnings('default')
 def test_ros(numbers, tmp_path):
-    with linked_process(tmp_path, '-p', 'use_sim_time:=true') as (node, link):
+    with linked_process(tmp_path, {'use_sim_time': True}) as (node, link):
         node.wait_until_settled()
         clock = link.probe.create_publisher(Clock, '/clock', 1)
         run_cases(numbers, lambda number: send(number, node, link, clock))
