@@ -12,7 +12,6 @@ import multiprocessing
 import os
 import platform
 import signal
-import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
@@ -22,7 +21,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-import gp_ground_seg
+from gp_ground_seg import __version__
 from gp_ground_seg.core.errors import LOGGER, DataError, in_one_line, messages_passed_to, require
 
 BLOCK_SIZE = 64
@@ -74,39 +73,36 @@ class Runner:
         with self._bar(total=size_of(items)) as bar:
             if self._client is None:
                 return [function(items, partial(_count, bar))]
+            from distributed import as_completed
+
+            compute, said = partial(_compute_block, __version__, function), set[str]()
             blocks = cut(items, group, self.n_workers)
-            found: list[Any] = [None] * len(blocks)
-            for k, result in self._compute(function, blocks):
-                found[k] = result
-                bar.update(size_of(blocks[k]))
+            futures = self._client.map(compute, blocks, pure=False)
+            numbers, found = {future: k for k, future in enumerate(futures)}, [None] * len(blocks)
+            for future in as_completed(futures, loop=self._client.loop):
+                block = blocks[k := numbers[future]]
+                found[k], notes = _result_of(future, block)
+                bar.update(size_of(block))
+                for level, line in notes:
+                    if line not in said:
+                        said.add(line)
+                        LOGGER.log(level, '%s', line)
         return found
 
-    def _compute(
-        self, function: Function, blocks: Sequence[Sequence[Any]]
-    ) -> Iterator[tuple[int, Any]]:
-        """Yield the number and the result of each block when it is finished."""
-        from distributed import KilledWorker, as_completed
 
-        compute, said = partial(_compute_block, _versions(), function), set[str]()
-        numbers = {
-            self._client.submit(compute, block, pure=False): k for k, block in enumerate(blocks)
-        }
-        for future in as_completed([*numbers], loop=self._client.loop):
-            k = numbers.pop(future)  # or the cluster would keep the result
-            try:
-                result, notes = future.result()
-            except CancelledError as error:
-                raise DataError('the scheduler is lost') from error
-            except KilledWorker as error:
-                raise DataError(
-                    f'{blocks[k][0]} to {blocks[k][-1]}: each worker that computed this block '
-                    'died, as where memory is short: fewer workers have more of it each'
-                ) from error
-            for level, line in notes:
-                if line not in said:
-                    said.add(line)
-                    LOGGER.log(level, '%s', line)
-            yield k, result
+def _result_of(future: Any, block: Sequence[Any]) -> Any:
+    """Return what `_compute_block` did; DataError if workers or the scheduler died."""
+    from distributed import KilledWorker
+
+    try:
+        return future.result()
+    except CancelledError as error:
+        raise DataError('the scheduler is lost') from error
+    except KilledWorker as error:
+        raise DataError(
+            f'{block[0]} to {block[-1]}: each worker that computed this block died, as where '
+            'memory is short: fewer workers have more of it each'
+        ) from error
 
 
 HERE = Runner()
@@ -135,7 +131,7 @@ def cut(
 
 def package_versions(*packages: str) -> dict[str, str | None]:
     """Versions of what labels depend on, and of further `packages`; None: not installed."""
-    versions: dict[str, str | None] = {'gp_ground_seg': gp_ground_seg.__version__}
+    versions: dict[str, str | None] = {'gp_ground_seg': __version__}
     for package in ('numpy', 'scipy', 'numba', *packages):
         try:
             versions[package] = importlib.metadata.version(package)
@@ -144,24 +140,13 @@ def package_versions(*packages: str) -> dict[str, str | None]:
     return versions
 
 
-def _versions() -> dict[str, str | None]:
-    """Versions of what labels depend on."""
-    return {**package_versions(), 'Python': platform.python_version()}
-
-
-def _compute_block(
-    expected: dict[str, str | None], function: Function, block: Sequence[Any]
-) -> tuple[Any, _Notes]:
+def _compute_block(version: str, function: Function, block: Sequence[Any]) -> tuple[Any, _Notes]:
     """Compute a block in a worker; return the result and what the library logged meanwhile."""
-    here, notes = _versions(), _Notes()
-    other = [
-        f'{name} {v}, not {expected[name]}' for name, v in here.items() if v != expected[name]
-    ]
-    if here['gp_ground_seg'] != expected['gp_ground_seg']:
-        raise DataError(f'a worker on {platform.node()} has {"; ".join(other)}')
-    if other:
-        line = f'a worker on {platform.node()} has {"; ".join(other)}: last digits may differ'
-        notes.append((logging.WARNING, line))
+    if version != __version__:
+        raise DataError(
+            f'a worker on {platform.node()} has gp_ground_seg {__version__}, not {version}'
+        )
+    notes = _Notes()
     with messages_passed_to(lambda *message: notes.append(message)):
         return function(block, iter), notes
 
@@ -261,10 +246,7 @@ def _connect(address: str) -> Any:
         raise DataError(f'--scheduler {address}: must be tcp://HOST:PORT, or tls://')
     distributed = _quiet_distributed()
     try:
-        with warnings.catch_warnings():
-            # Versions are compared by `_compute_block`, which says in one line what differs.
-            warnings.simplefilter('ignore', distributed.versions.VersionMismatchWarning)
-            return distributed.Client(address, set_as_default=False, timeout=CONNECT_TIMEOUT)
+        return distributed.Client(address, set_as_default=False, timeout=CONNECT_TIMEOUT)
     except (OSError, ValueError, TypeError, MemoryError) as error:  # memory: no Dask speaks there
         text = f'--scheduler {address}: does not answer ({in_one_line(error)})'
         raise DataError(text) from error
