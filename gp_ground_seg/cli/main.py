@@ -16,8 +16,13 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from typing import NoReturn
 
 from gp_ground_seg import __version__
-from gp_ground_seg.core.errors import GroundSegError, in_one_line, reason_of, shown
-from gp_ground_seg.core.parameters.schema import did_you_mean
+from gp_ground_seg.core.errors import (
+    GroundSegError,
+    in_one_line,
+    messages_passed_to,
+    reason_of,
+    shown,
+)
 
 ROS_ARGS = '--ros-args'
 COLLECT_AFTER = 50_000
@@ -69,8 +74,7 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise a GroundSegError, which names the help."""
-        parts = [self.prog.partition(' ')[2], message.removeprefix('argument ')]
-        raise GroundSegError(f'{": ".join(filter(None, parts))}; {self.prog} --help explains it')
+        raise GroundSegError(f'{message.removeprefix("argument ")}; see {self.prog} --help')
 
 
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:
@@ -102,31 +106,23 @@ def _parse(words: list[str]) -> argparse.Namespace:
     """Parse the words before ``--ros-args``; it and what follows is ROS's to read."""
     n_before = words.index(ROS_ARGS) if ROS_ARGS in words else len(words)
     command = next((word for word in words[:n_before] if not word.startswith('-')), None)
-    if command not in (None, *COMMANDS):
-        hint = did_you_mean(command or '', COMMANDS) or '; --help lists them'
-        raise GroundSegError(f'{command}: no such command{hint}')
-    arguments, unknown = build_parser(command).parse_known_args(words[:n_before])
-    takes_ros_args = getattr(arguments, 'accepts_ros_args', False)
-    if unknown:
-        hint = f'{ROS_ARGS} before what ROS reads, or ' if takes_ros_args else ''
-        raise GroundSegError(
-            f'{command}: unrecognized arguments: {" ".join(unknown)}; '
-            f'try {hint}gp-ground-seg {command} --help'
-        )
+    parser = build_parser(command if command in COMMANDS else None)
+    arguments = parser.parse_args(words[:n_before])
     arguments.ros_args = words[n_before:]
-    if arguments.ros_args and not takes_ros_args:
+    arguments.is_node = getattr(arguments, 'accepts_ros_args', False)
+    if arguments.ros_args and not arguments.is_node:
         raise GroundSegError(f'{command}: {ROS_ARGS}: this command takes none')
     return arguments
 
 
 def _notes(arguments: argparse.Namespace) -> AbstractContextManager[None]:
     """Print what the library logs as notes, except in a node, which logs by way of ROS."""
-    if getattr(arguments, 'accepts_ros_args', False):
+    if arguments.is_node:
         return nullcontext()
-    from gp_ground_seg.cli.options import library_notes
+    from gp_ground_seg.cli.options import note
 
-    quiet = getattr(arguments, 'quiet', False)
-    return library_notes(logging.WARNING if quiet else logging.INFO)
+    level = logging.WARNING if getattr(arguments, 'quiet', False) else logging.INFO
+    return messages_passed_to(lambda _, text: note(text), level)
 
 
 @contextmanager
@@ -173,7 +169,7 @@ def _run(words: list[str]) -> int:
     try:
         with _interruptible():
             arguments = _parse(words)
-            if not getattr(arguments, 'accepts_ros_args', False):  # a node runs for days
+            if not arguments.is_node:  # that runs for days
                 gc.set_threshold(COLLECT_AFTER)
             with _notes(arguments):
                 code: int = arguments.run(arguments)

@@ -3,31 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import math
 import sys
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, suppress
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from gp_ground_seg.core.errors import (
-    ConfigError,
-    DataError,
-    in_thousands,
-    messages_passed_to,
-    shown,
-)
+from gp_ground_seg.core.errors import ConfigError, DataError, in_thousands, shown
 from gp_ground_seg.core.jit import has_to_compile
 from gp_ground_seg.core.parameters.config import PRESETS, Config, find_preset
-from gp_ground_seg.core.parameters.schema import (
-    YAML_SUFFIXES,
-    did_you_mean,
-    load_yaml,
-)
+from gp_ground_seg.core.parameters.schema import did_you_mean, load_yaml
 from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, MIN_COLUMNS
 from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.lab.cluster import Runner, open_runner
@@ -171,12 +159,8 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 def read_config(arguments: argparse.Namespace) -> Config:
     """Return the preset, changed by the file, changed by the settings."""
-    if arguments.preset.endswith(YAML_SUFFIXES):
-        raise ConfigError(f'--preset {arguments.preset}: is a file, which --config reads')
     config = find_preset(arguments.preset).config
     if arguments.config:
-        if arguments.config in PRESETS and not Path(arguments.config).exists():
-            raise ConfigError(f'--config {arguments.config}: is a preset, which --preset takes')
         config = Config.from_yaml(arguments.config, config)
     return config.replace(**dict(parse_setting(setting) for setting in arguments.settings))
 
@@ -213,11 +197,6 @@ def note(message: str) -> None:
     """Print a line on standard error that is neither result nor error."""
     with suppress(OSError):  # standard error may be full
         print(f'gp-ground-seg: note: {shown(message)}', file=sys.stderr)
-
-
-def library_notes(level: int = logging.INFO) -> AbstractContextManager[None]:
-    """Print what the library logs, such as that it compiles, as notes within the block."""
-    return messages_passed_to(lambda _, text: note(text), level)
 
 
 def count(number: int, noun: str) -> str:
