@@ -54,17 +54,6 @@ def test_package_xml_is_that_of_this_package(package):
     assert launched <= depends | {'pathlib', 'yaml', PACKAGE}
 
 
-def test_package_xml_has_its_elements_in_the_order_of_rep_149(package):
-    order = ['name', 'version', 'description', 'maintainer', 'license', 'url', 'author']
-    tags = [element.tag for element in package]
-    first = [tag for tag in tags if tag in order]
-    assert first == sorted(first, key=order.index) == tags[: len(first)]
-    depends = [k for k, tag in enumerate(tags) if tag.endswith('depend')]
-    assert tags[-1] == 'export' and depends == [*range(depends[0], len(tags) - 1)]
-    names = [package[k].text for k in depends]
-    assert len(set(names)) == len(names)
-
-
 def test_one_version(package):
     """Of the newest section of the changelog as well, unless that is of the next release."""
     version = gp_ground_seg.__version__
