@@ -46,27 +46,15 @@ COMMANDS = {
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
 }
-GROUPS = {'robot': 'node', 'files': 'segment', 'laboratory': 'evaluate'}
-"""Groups of commands in the help, each with its first command."""
-
 EXAMPLES = """\
+`gp-ground-seg COMMAND --help` explains a command.
+
 examples:
   gp-ground-seg demo                             show the node at work, no data needed
   gp-ground-seg segment drive.mcap -o out.mcap   ground and obstacle clouds of a bag
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08
   gp-ground-seg node --ros-args -r points:=/kitti/velo/pointcloud
 """
-
-
-def _grouped_commands() -> str:
-    """Return a line for each command, under the title of its group."""
-    titles = {first: title for title, first in GROUPS.items()}
-    lines = []
-    for name, (_, purpose) in COMMANDS.items():
-        if name in titles:
-            lines.append(f'{titles[name]}:')
-        lines.append(f'  {name:<14}{purpose}')
-    return '\n'.join(lines)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -86,19 +74,13 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument('--version', action='version', version=__version__)
-    subparsers = parser.add_subparsers(
-        title='commands',
-        description=_grouped_commands(),
-        metavar='COMMAND',
-        help='explained by `gp-ground-seg COMMAND --help`',
-        required=True,
-    )
+    subparsers = parser.add_subparsers(title='commands', metavar='COMMAND', required=True)
     if command is not None:
         module = COMMANDS[command][0]
         importlib.import_module(f'gp_ground_seg.cli.{module}').add_parser(subparsers)
     else:
-        for name in COMMANDS:
-            subparsers.add_parser(name)
+        for name, (_, purpose) in COMMANDS.items():
+            subparsers.add_parser(name, help=purpose)
     return parser
 
 

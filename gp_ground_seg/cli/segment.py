@@ -202,8 +202,8 @@ def _print_summary(found: Sequence[Outcome], target: Path, n_workers: int = 0) -
     seconds = [one.seconds for one in found]
     n_points, n_ground = sum(one.n_points for one in found), sum(one.n_ground for one in found)
     share = f'{n_ground / n_points:.1%} ground' if n_points else 'no ground'
-    pace = f'{1e3 * statistics.median(seconds[1:] or seconds):.1f} ms'
-    pace += ' per frame (median' if len(seconds) > 1 else ' for the first frame (with loading code'
+    # The first may load code.
+    pace = f'{1e3 * statistics.median(seconds[1:] or seconds):.1f} ms per frame (median'
     beside = f' in each of {options.count(n_workers, "worker")}' if n_workers else ''
     print(
         f'{options.count(len(found), "frame")}, {options.count(n_points, "point")}, '

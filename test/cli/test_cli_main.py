@@ -19,16 +19,11 @@ from gp_ground_seg.cli.experiment import EXPERIMENTS
 HEAVY = {'numba', 'scipy', 'matplotlib', 'pandas', 'rosbags', 'rclpy'}
 
 
-def test_the_help_groups_the_commands(capsys):
+def test_the_help_has_the_purpose_of_each_command(capsys):
     with pytest.raises(SystemExit, match='0'):
         cli.main(['--help'])
-    lines = capsys.readouterr().out.partition('commands:\n')[2].partition('examples:')[0]
-    words = [line.split()[0] for line in lines.splitlines() if line.strip()]
-    titles = [f'{title}:' for title in cli.GROUPS]
-    assert [word for word in words if word in titles] == titles
-    assert [word for word in words if word in cli.COMMANDS] == list(cli.COMMANDS)
-    assert words.index('files:') < words.index('segment') < words.index('laboratory:')
-    assert all(purpose in lines for _, purpose in cli.COMMANDS.values())
+    said = ' '.join(capsys.readouterr().out.split())
+    assert all(f'{name} {purpose}' in said for name, (_, purpose) in cli.COMMANDS.items())
 
 
 @pytest.mark.parametrize(

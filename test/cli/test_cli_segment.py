@@ -25,8 +25,8 @@ from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
 SUMMARY = re.compile(
-    r'(\d+) frames?, ([\d ]+) points?, (\d+\.\d)% ground, \d+\.\d ms (?:per frame \(median|for '
-    r'the first frame \(with loading code), segmentation only\), written to (.*)\n'
+    r'(\d+) frames?, ([\d ]+) points?, (\d+\.\d)% ground, \d+\.\d ms per frame \(median, '
+    r'segmentation only\), written to (.*)\n'
     r'measured in \d+ frames?: sensor.height=.*\n'
 )
 
