@@ -14,7 +14,7 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
-from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
+from gp_ground_seg.data.bag_files import BAG_SUFFIXES
 from gp_ground_seg.data.cloud_files import FORMATS, LABELS, format_for
 from gp_ground_seg.data.files import write_file
 from gp_ground_seg.data.inputs import Inputs, holds_bag, list_inputs
@@ -61,7 +61,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Declare the commands."""
     parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
     parser.usage = '%(prog)s INPUT [BAG ...] [-o OUT] [options]'
-    formats = (*FORMATS, *SUFFIX_OF_STORAGE)
     options.add(
         parser,
         ('input', 'scan, folder of scans, bag, or a root', {'metavar': 'INPUT'}),
@@ -69,9 +68,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('-o --output', 'for scans a folder, or a file for a single scan; for bags a folder, or '
          'a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
          {'metavar': 'OUT'}),
-        ('--format', 'of the output (default: by the name of OUT, else labels of .bin scans, and '
-         f'as the input; mcap for ROS 1): {", ".join(formats)}',
-         {'choices': formats, 'metavar': 'FORMAT'}),
+        ('--format', 'of a file for each scan or cloud (default: by the name of OUT, else labels '
+         f'of .bin scans, and as the input): {", ".join(FORMATS)}',
+         {'choices': FORMATS, 'metavar': 'FORMAT'}),
         *options.CLOUDS,
         options.FORCE,
         options.QUIET,
@@ -113,11 +112,8 @@ def _list_items(arguments: argparse.Namespace, target: Path) -> tuple[list[Item]
     source, form = Path(arguments.input), arguments.format
     if arguments.more:
         return _list_bags(arguments), False
-    if holds_bag(source) and form not in FORMATS:
+    if holds_bag(source) and form is None:
         return [_bag_item(source, target.name, arguments)], True
-    if not holds_bag(source):
-        of_bags = ['topic', *['format'] * (form not in FORMATS)]
-        options.refuse(arguments, of_bags, f'is for bags, which {source} is not')
     if is_root(source):
         return _list_root(arguments), False
     scans = options.list_clouds(arguments)
@@ -149,13 +145,15 @@ def _list_root(arguments: argparse.Namespace) -> list[Item]:
         raise DataError(f'--format {arguments.format}: a KITTI_ROOT gives .label files')
     items = []
     for sequence in list_sequences(arguments.input):
-        scans = list_inputs(Path(arguments.input, 'sequences', sequence), columns)
+        folder = Path(arguments.input, 'sequences', sequence)
+        scans = list_inputs(folder, columns, arguments.topic)
         items += _scan_items(scans, LABELS, f'sequences/{sequence}/predictions/')
     return items
 
 
 def _list_bags(arguments: argparse.Namespace) -> list[Item]:
     """List several bags, each of which becomes one in the output folder."""
+    options.refuse(arguments, ['format'], 'is for scans, or for one bag')
     paths = [Path(source) for source in (arguments.input, *arguments.more)]
     for path in paths:
         if not holds_bag(path):
@@ -171,7 +169,7 @@ def _bag_item(path: Path, name: str, arguments: argparse.Namespace) -> Item:
     """Item of a bag that becomes the bag `name`."""
     options.refuse(arguments, ['columns'], f'is for .bin scans, which {path} is not')
     n_clouds = len(list_inputs(path, topic=arguments.topic))
-    write = partial(write_bag, path, name, arguments.topic, arguments.format)
+    write = partial(write_bag, path, name, arguments.topic)
     return Item(path, [name], write, n_clouds)
 
 
@@ -192,7 +190,7 @@ def _default_output(source: Path, form: str | None = None) -> Path:
     if named.is_dir():
         return named.with_name(f'{named.name}_ground')
     suffix = '' if named.suffix in ('.bag', '.bin') else named.suffix
-    if form in FORMATS:
+    if form is not None:
         suffix = '' if named.suffix in BAG_SUFFIXES else f'.{form}'
     return named.with_name(f'{named.stem}_ground{suffix}')
 

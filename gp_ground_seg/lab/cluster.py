@@ -242,8 +242,6 @@ def _ctrl_c_kept() -> Iterator[None]:
 
 def _connect(address: str) -> Any:
     """Connect to a scheduler, with the keys of Dask's configuration."""
-    if not address.startswith(('tcp://', 'tls://')):
-        raise DataError(f'--scheduler {address}: must be tcp://HOST:PORT, or tls://')
     distributed = _quiet_distributed()
     try:
         return distributed.Client(address, set_as_default=False, timeout=CONNECT_TIMEOUT)

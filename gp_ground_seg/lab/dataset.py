@@ -71,30 +71,19 @@ def write_scans(
 
 
 def write_bag(
-    source: Path,
-    name: str,
-    topic: str | None,
-    storage: str | None,
-    segmenter: GroundSegmenter,
-    folder: Path,
+    source: Path, name: str, topic: str | None, segmenter: GroundSegmenter, folder: Path
 ) -> Iterator[Segmentation]:
     """Write the bag `name` of the clouds of `source`, and yield the result for each.
 
-    The bag appears when the iteration ends. Raises DataError if a cloud cannot be read, or the
-    bag cannot be written.
-
-    Parameters
-    ----------
-    topic : str or None
-        PointCloud2 topic to segment, by default the only one.
-    storage : str or None
-        ``mcap`` or ``sqlite3``; by default that of the suffix, else that of the input.
+    It is stored as its suffix says, else as the input, and appears when the iteration ends. By
+    default `topic` is the only one of PointCloud2. Raises DataError if a cloud cannot be read, or
+    the bag cannot be written.
     """
     target = folder / name
     with BagReader(source) as bag:
         topic = bag.pick_point_cloud_topic(topic)
-        if not (storage or target.suffix in BAG_SUFFIXES or bag.storage == 'ros1'):
-            storage = bag.storage
+        is_told = target.suffix in BAG_SUFFIXES or bag.storage == 'ros1'
+        storage = None if is_told else bag.storage
         with BagWriter(target, storage=storage, force=True) as output:
             for part in TOPICS:
                 output.add_topic(part)

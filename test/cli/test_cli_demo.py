@@ -86,7 +86,7 @@ def test_demo_without_data(rclpy, tmp_path):
 
 @pytest.mark.slow
 def test_a_demo_whose_node_dies_keeps_bag_and_log_and_says_how_to_go_on(rclpy, tmp_path):
-    with start('demo', '--frames', 100, cwd=tmp_path) as process:
+    with start('demo', '--frames', 20, cwd=tmp_path) as process:
         while '[3/3]' not in (line := process.stdout.readline()):
             assert line
         (node,) = children(process.pid)

@@ -95,7 +95,6 @@ def assert_splits(source, result, topic, segmenter):
         ('drive.db3', '', 'drive_ground.db3', 'sqlite3'),
         ('drive.bag', '', 'drive_ground', 'mcap'),
         ('drive.db3', '-o out', 'out', 'sqlite3'),
-        ('drive.db3', '-o out --format mcap', 'out', 'mcap'),
         ('drive.db3', '-o out.mcap', 'out.mcap', 'mcap'),
         ('two.mcap', '--topic /front', 'two_ground.mcap', 'mcap'),
         ('two.mcap', '--topic /ground', 'two_ground.mcap', 'mcap'),
@@ -228,7 +227,7 @@ def content(folder):
     [
         ('drive.mcap --topic /note', '/note is of type std_msgs/msg/String, must be sensor_msgs'),
         ('unfinished', 'no metadata.yaml in it); bag files in it'),
-        ('drive.mcap --format sqlite3 -o x.mcap', 'ends in .mcap, which is not sqlite3'),
+        ('drive.mcap drive.mcap --format ply -o x', '--format: is for scans, or for one bag'),
         ('drive.mcap -o x.bag', 'only ROS 2 bags are written'),
         ('drive.mcap -o no/such/x', 'no/such does not exist'),
         ('drive.mcap -o . --force', 'is the input, or has it in it'),
