@@ -10,7 +10,6 @@ import logging
 import os
 import signal
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import NoReturn
@@ -114,9 +113,6 @@ def _interruptible() -> Iterator[None]:
     numba does either when SIGINT comes while it compiles or loads code. SIGINT counts also where
     it is ignored at the start, as in the background of a script: `kill -INT` ends a command there.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     is_interrupted = False
 
     def note(_number: int, _frame: object) -> None:

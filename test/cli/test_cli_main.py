@@ -14,7 +14,6 @@ from cli_runner import error_line
 
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.experiment import EXPERIMENTS
 
 HEAVY = {'numba', 'scipy', 'matplotlib', 'pandas', 'rosbags', 'rclpy'}
 
@@ -75,13 +74,6 @@ def test_every_help_has_examples_that_can_be_run(name, capsys):
             words = shlex.split(re.split(r'  +| > | &$| --ros-args', example)[0])[1:]
             cli.build_parser(words[0]).parse_args(words)
     assert capsys.readouterr().err == ''
-
-
-def test_whatever_prints_a_table_has_json():
-    leaves = [leaf for name in cli.COMMANDS for leaf in parsers_below(cli.build_parser(name))]
-    found = {leaf.prog.split(' ', 1)[1] for leaf in leaves if '--json' in leaf.format_usage()}
-    experiments = {f'experiment {name}' for name in EXPERIMENTS}
-    assert found == {'evaluate'} | experiments
 
 
 ENTRY = 'from gp_ground_seg.cli.main import main; main({})'

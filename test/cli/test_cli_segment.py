@@ -183,22 +183,6 @@ def test_scans_give_label_files(segmenter, tmp_path, capsys, monkeypatch, scans,
     assert hidden(out.parent) == hidden(out) == []
 
 
-def test_force_replaces_what_is_written_and_nothing_else(segmenter, tmp_path):
-    write_scans(tmp_path / 'velodyne', n_scans=2)
-    out = tmp_path / 'labels'
-    out.mkdir()
-    for name in ('000001.label', 'readme'):
-        (out / name).write_text('mine')
-    for source, target, k in (
-        ('velodyne/000000.bin', out / '000001.label', 0),
-        ('velodyne', out, 1),
-    ):
-        assert segment(tmp_path / source, '-o', target, '--force') == 0
-        written = np.fromfile(out / '000001.label', dtype='<u4')
-        np.testing.assert_array_equal(written, expected_labels(segmenter, k))
-    assert (out / 'readme').read_text() == 'mine'
-
-
 @pytest.fixture(scope='module')
 def inputs(tmp_path_factory):
     """A folder with inputs of every kind, good and bad ones."""

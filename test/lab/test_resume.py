@@ -109,8 +109,10 @@ def test_what_is_missing_or_older_than_its_input_is_done_again(segmented, tmp_pa
     outputs[0].touch()
     assert said('-o', out).startswith('1 of 11 were finished before\n10 frames, ')
     known = label_files(out)
+    (out / 'readme').write_text('mine')
     said('-o', out, '--set', 'label.ground_tolerance=0.2', '--force')
     assert label_files(out) != known and label_files(out).keys() == known.keys()
+    assert (out / 'readme').read_text() == 'mine'
     assert run('config', 'check', out / PARAMETERS) == 0
     assert '1 differs from the defaults' in capsys.readouterr().out
 
