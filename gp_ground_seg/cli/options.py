@@ -15,7 +15,7 @@ from tqdm import tqdm
 from gp_ground_seg.core.errors import ConfigError, DataError, in_thousands, shown
 from gp_ground_seg.core.jit import has_to_compile
 from gp_ground_seg.core.parameters.config import PRESETS, Config, find_preset
-from gp_ground_seg.core.parameters.schema import did_you_mean, load_yaml
+from gp_ground_seg.core.parameters.schema import load_yaml
 from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, MIN_COLUMNS
 from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.lab.cluster import Runner, open_runner
@@ -133,12 +133,10 @@ def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:
     names = list(known)
 
     def parse(text: str) -> list[str]:
-        words = [word for word in text.split(',') if word]
-        unknown = next((word for word in words if word not in names), None)
-        if unknown or not words or len(set(words)) < len(words):
-            hint = did_you_mean(unknown, names) if unknown else ''
+        words = text.split(',')
+        if len({*words} & {*names}) < len(words):
             wanted = f'some of {",".join(names)}, each once'
-            raise argparse.ArgumentTypeError(f'{text!r}: must be {wanted}{hint}')
+            raise argparse.ArgumentTypeError(f'{text!r}: must be {wanted}')
         return words
 
     return parse

@@ -33,7 +33,7 @@ def test_the_help_has_the_purpose_of_each_command(capsys):
         ('demo --ros-args -r a:=b', 'demo: --ros-args: this command takes none'),
         ('plot segment A -o B --segment 1,', "--segment: '1,': must be whole numbers, as in"),
         ('experiment scenes --scenes flt',
-         "--scenes: 'flt': must be some of .*, each once; did you mean flat"),
+         "--scenes: 'flt': must be some of .*, each once"),
         ('segment A --workers x', "--workers: 'x': must be a whole number, at least 1; see "),
         ('demo --frames 0', "--frames: '0': must be a whole number, at least 1"),
         ('segment A --columns 2', "--columns: '2': must be a whole number, at least 3"),
