@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import INTERRUPTED, PATIENCE, children, is_running, start, wait_for
+from cli_runner import PATIENCE, children, is_running, start, until_ctrl_c, wait_for
 from conftest import REPOSITORY
 
 from gp_ground_seg.cli import demo
@@ -101,21 +101,20 @@ def test_a_demo_whose_node_dies_keeps_bag_and_log_and_says_how_to_go_on(rclpy, t
     assert files == ['drive.mcap', 'node.log']
 
 
-@pytest.mark.parametrize(
-    'number', [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
-)
-def test_a_stopped_demo_leaves_no_node(rclpy, tmp_path, number):
+def test_an_interrupted_demo_leaves_no_node(rclpy, tmp_path):
+    with until_ctrl_c('demo', '--frames', 500, cwd=tmp_path) as process:
+        wait_for(lambda: children(process.pid), 'node')
+        nodes = children(process.pid)
+    assert not any(is_running(pid) for pid in nodes)
+    assert {*map(str, tmp_path.rglob('*.*'))} <= {str(tmp_path / 'demo_output/node.log')}
+
+
+@pytest.mark.slow
+def test_a_killed_demo_leaves_no_node(rclpy, tmp_path):
     with start('demo', '--frames', 500, cwd=tmp_path) as process:
         wait_for(lambda: children(process.pid), 'node')
         nodes = children(process.pid)
-        # To this process alone, as `kill` does; a terminal tells the node too.
-        process.send_signal(number)
-        _, errors = process.communicate(timeout=PATIENCE)
-    if number == signal.SIGINT:
-        assert process.returncode in INTERRUPTED
-        assert errors.splitlines()[-1] == 'gp-ground-seg: interrupted'
-        assert not any(is_running(pid) for pid in nodes)
-        assert {*map(str, tmp_path.rglob('*.*'))} <= {str(tmp_path / 'demo_output/node.log')}
+        process.kill()
     wait_for(lambda: not any(is_running(pid) for pid in nodes), 'end of the node')
 
 

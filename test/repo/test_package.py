@@ -108,16 +108,6 @@ def test_every_public_name_is_there():
         gp_ground_seg.Nothing  # noqa: B018
 
 
-def test_no_path_of_one_machine_and_no_data_is_tracked():
-    listed = subprocess.run(
-        ['git', 'ls-files'], cwd=REPOSITORY, capture_output=True, text=True, check=False
-    )
-    if listed.returncode:
-        pytest.skip('not a git checkout')
-    files = listed.stdout.split()
-    assert not [name for name in files if name.endswith(('.bin', '.label', '.mcap', '.db3'))]
-
-
 def test_what_others_can_change_is_named_by_its_digest():
     """Tags of actions and images are moved; the container does not run as root."""
     workflow = (REPOSITORY / '.github/workflows/test.yml').read_text(encoding='utf-8')
