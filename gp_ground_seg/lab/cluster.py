@@ -22,7 +22,14 @@ from typing import Any
 from tqdm import tqdm
 
 from gp_ground_seg import __version__
-from gp_ground_seg.core.errors import LOGGER, DataError, in_one_line, messages_passed_to, require
+from gp_ground_seg.core.errors import (
+    LOGGER,
+    DataError,
+    in_one_line,
+    log_once,
+    messages_passed_to,
+    require,
+)
 
 BLOCK_SIZE = 64
 """Items of a block, where there are enough for all workers: they share what a task costs."""
@@ -33,7 +40,7 @@ PACKAGES = 'distributed cryptography'
 
 _NO_BAR = partial(tqdm, disable=True)
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
-"""Wraps items to show how far the work is, as tqdm does."""
+"""Wraps items, once, to show how far the work is, as tqdm does."""
 Function = Callable[[Sequence[Any], Progress], Any]
 """Computes a block of items; a module's function or a `partial` of one, to be sent to workers."""
 _Notes = list[tuple[int, str]]  # what the library logs: severity and text
@@ -45,7 +52,7 @@ class Runner:
     Parameters
     ----------
     bar : callable
-        Makes the progress bar of a number of items, ``bar(total=n)``.
+        Makes a progress bar, as tqdm does.
     client : distributed.Client, optional
         Of the cluster that computes the blocks.
     n_workers : int
@@ -70,23 +77,21 @@ class Runner:
         of each block. A block whose worker dies is computed again. Raises what `function` raises,
         and DataError if every worker that computes a block dies, or the scheduler is lost.
         """
-        with self._bar(total=size_of(items)) as bar:
-            if self._client is None:
-                return [function(items, partial(_count, bar))]
-            from distributed import as_completed
+        if self._client is None:
+            return [function(items, partial(self._bar, total=size_of(items)))]
+        from distributed import as_completed
 
-            compute, said = partial(_compute_block, __version__, function), set[str]()
-            blocks = cut(items, group, self.n_workers)
-            futures = self._client.map(compute, blocks, pure=False)
-            numbers, found = {future: k for k, future in enumerate(futures)}, [None] * len(blocks)
+        blocks = cut(items, group, self.n_workers)
+        compute = partial(_compute_block, __version__, function)
+        futures = self._client.map(compute, blocks, pure=False)
+        numbers, found = {future: k for k, future in enumerate(futures)}, [None] * len(blocks)
+        with self._bar(total=size_of(items)) as bar:
             for future in as_completed(futures, loop=self._client.loop):
                 block = blocks[k := numbers[future]]
                 found[k], notes = _result_of(future, block)
+                for note in notes:
+                    log_once(*note)
                 bar.update(size_of(block))
-                for level, line in notes:
-                    if line not in said:
-                        said.add(line)
-                        LOGGER.log(level, '%s', line)
         return found
 
 
@@ -107,12 +112,6 @@ def _result_of(future: Any, block: Sequence[Any]) -> Any:
 
 HERE = Runner()
 """In this process, without a bar."""
-
-
-def _count(bar: tqdm[Any], items: Iterable[Any]) -> Iterator[Any]:
-    for item in items:
-        yield item
-        bar.update()
 
 
 def cut(
@@ -167,11 +166,8 @@ def open_runner(
                 LOGGER.warning('the scheduler has no worker yet, waiting for one')
             yield Runner(bar, client, n_workers)
     elif workers is not None:
-        most = 4 * (os.cpu_count() or 1)
-        if workers > most:
-            raise DataError(
-                f'--workers {workers}: must be 1 to {most} here, four for each processor'
-            )
+        if workers > (most := 4 * (os.cpu_count() or 1)):
+            raise DataError(f'--workers {workers}: more than {most}, four for each processor')
         with _start_workers(workers) as client:
             yield Runner(bar, client, workers)
     else:
