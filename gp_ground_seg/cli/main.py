@@ -90,15 +90,19 @@ def _parse(words: list[str]) -> argparse.Namespace:
     parser = build_parser(command if command in COMMANDS else None)
     arguments = parser.parse_args(words[:n_before])
     arguments.ros_args = words[n_before:]
-    arguments.is_node = getattr(arguments, 'accepts_ros_args', False)
-    if arguments.ros_args and not arguments.is_node:
+    if arguments.ros_args and not _is_node(arguments):
         raise GroundSegError(f'{command}: {ROS_ARGS}: this command takes none')
     return arguments
 
 
+def _is_node(arguments: argparse.Namespace) -> bool:
+    """Whether the command runs a node: it reads what follows ``--ros-args``, and logs by ROS."""
+    return getattr(arguments, 'accepts_ros_args', False)
+
+
 def _notes(arguments: argparse.Namespace) -> AbstractContextManager[None]:
-    """Print what the library logs as notes, except in a node, which logs by way of ROS."""
-    if arguments.is_node:
+    """Print what the library logs as notes, except in a node."""
+    if _is_node(arguments):
         return nullcontext()
     from gp_ground_seg.cli.options import note
 
@@ -147,7 +151,7 @@ def _run(words: list[str]) -> int:
     try:
         with _interruptible():
             arguments = _parse(words)
-            if not arguments.is_node:  # that runs for days
+            if not _is_node(arguments):  # that runs for days
                 gc.set_threshold(COLLECT_AFTER)
             with _notes(arguments):
                 code: int = arguments.run(arguments)
