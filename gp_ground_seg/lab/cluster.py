@@ -15,6 +15,7 @@ import signal
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import resource_tracker
 from typing import Any
@@ -46,10 +47,11 @@ Function = Callable[[Sequence[Any], Progress], Any]
 _Notes = list[tuple[int, str]]  # what the library logs: severity and text
 
 
+@dataclass(frozen=True)
 class Runner:
     """Computes blocks of items; by default one after the other, in this process.
 
-    Parameters
+    Attributes
     ----------
     bar : callable
         Makes a progress bar, as tqdm does.
@@ -59,10 +61,9 @@ class Runner:
         How many there are; 0 in this process.
     """
 
-    def __init__(
-        self, bar: Callable[..., tqdm[Any]] = _NO_BAR, client: Any = None, n_workers: int = 0
-    ) -> None:
-        self._bar, self._client, self.n_workers = bar, client, n_workers
+    bar: Callable[..., tqdm[Any]] = _NO_BAR
+    client: Any = None
+    n_workers: int = 0
 
     def run(
         self,
@@ -77,16 +78,16 @@ class Runner:
         of each block. A block whose worker dies is computed again. Raises what `function` raises,
         and DataError if every worker that computes a block dies, or the scheduler is lost.
         """
-        if self._client is None:
-            return [function(items, partial(self._bar, total=size_of(items)))]
+        if self.client is None:
+            return [function(items, partial(self.bar, total=size_of(items)))]
         from distributed import as_completed
 
         blocks = cut(items, group, self.n_workers)
         compute = partial(_compute_block, __version__, function)
-        futures = self._client.map(compute, blocks, pure=False)
+        futures = self.client.map(compute, blocks, pure=False)
         numbers, found = {future: k for k, future in enumerate(futures)}, [None] * len(blocks)
-        with self._bar(total=size_of(items)) as bar:
-            for future in as_completed(futures, loop=self._client.loop):
+        with self.bar(total=size_of(items)) as bar:
+            for future in as_completed(futures, loop=self.client.loop):
                 block = blocks[k := numbers[future]]
                 found[k], notes = _result_of(future, block)
                 for note in notes:

@@ -179,7 +179,7 @@ def test_workers_speak_tls_and_are_seen_on_this_machine_only():
         family = [psutil.Process(), *psutil.Process().children()]
         sockets = [socket for process in family for socket in process.net_connections()]
         assert {s.laddr.ip for s in sockets if s.status == psutil.CONN_LISTEN} == {'127.0.0.1'}
-        assert runner._client.scheduler.address.startswith('tls://')
+        assert runner.client.scheduler.address.startswith('tls://')
 
 
 @pytest.mark.parametrize(

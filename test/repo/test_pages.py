@@ -240,17 +240,6 @@ def test_a_table_without_empty_rows_and_columns_and_those_that_a_figure_keeps():
     assert figures.kept(figure, '\n\n'.join(parts)) == '\n\n'.join(parts[3:-1])
 
 
-def test_a_command_is_run_in_a_folder_of_its_own_and_its_figure_replaced(tmp_path):
-    (tmp_path / 'a.yaml').write_text('grid: {n_bins: 41}\n')
-    assert 'a.yaml' in figures.run('config check a.yaml', '', tmp_path)
-    assert figures.words_of('evaluate KITTI_ROOT', '/a b') == ['evaluate', '/a b', '--markdown']
-    (figure,) = figures.find_figures('docs/a.md', PAGE)
-    assert (figure.body, figure.digest, figure.needs_kitti) == ('stale\n', '12345678', False)
-    text = figures.replaced(PAGE, figure, body := figures.body_of(figure, TABLE, 'abc'))
-    assert text == PAGE.replace('stale\n', body).replace('12345678', figures.digest(body))
-    assert '`gp-ground-seg experiment scenes --sensors vlp-16` (commit abc)\n\n| a | n |' in text
-
-
 @pytest.mark.parametrize(
     ('shown', 'found', 'is_same'),
     [
