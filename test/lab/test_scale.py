@@ -79,7 +79,7 @@ def everything(path):
 @pytest.mark.parametrize(
     ('line', 'more'),
     [
-        ('evaluate ROOT', '--workers 2'),
+        pytest.param('evaluate ROOT', '--workers 2', marks=pytest.mark.slow),
         ('evaluate ROOT --peer patchworkpp', '--scheduler ADDRESS'),
         ('experiment ablation ROOT', '--scheduler ADDRESS'),
         ('experiment objects --sensors vlp-16 --scenes car_park --seeds 2', '--scheduler ADDRESS'),
@@ -259,6 +259,7 @@ def test_processes_that_are_stopped_leave_nothing_half_done(moment, victim, tmp_
     assert len([*(out / 'sequences/00/predictions').iterdir()]) == n_scans
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_ends_meanwhile(root, tmp_path):
     """As the machine that it runs on may."""
     words = [sys.executable, '-m', 'distributed.cli.dask_scheduler', '--no-dashboard', '--host']
