@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import gc
 import importlib
 import io
 import logging
@@ -24,9 +23,6 @@ from gp_ground_seg.core.errors import (
 )
 
 ROS_ARGS = '--ros-args'
-COLLECT_AFTER = 50_000
-"""New objects after which Python looks for garbage: compiling makes a million that stay, and with
-the usual 700 a tenth of its time goes into the search."""
 
 # Module in `gp_ground_seg.cli` and purpose of each command. The `add_parser(subparsers)` of a
 # module declares its commands: their options, and the default `run`, a function of the parsed
@@ -90,19 +86,14 @@ def _parse(words: list[str]) -> argparse.Namespace:
     parser = build_parser(command if command in COMMANDS else None)
     arguments = parser.parse_args(words[:n_before])
     arguments.ros_args = words[n_before:]
-    if arguments.ros_args and not _is_node(arguments):
+    if arguments.ros_args and not hasattr(arguments, 'accepts_ros_args'):
         raise GroundSegError(f'{command}: {ROS_ARGS}: this command takes none')
     return arguments
 
 
-def _is_node(arguments: argparse.Namespace) -> bool:
-    """Whether the command runs a node: it reads what follows ``--ros-args``, and logs by ROS."""
-    return getattr(arguments, 'accepts_ros_args', False)
-
-
 def _notes(arguments: argparse.Namespace) -> AbstractContextManager[None]:
-    """Print what the library logs as notes, except in a node."""
-    if _is_node(arguments):
+    """Print what the library logs as notes, except in a node, which logs by way of ROS."""
+    if hasattr(arguments, 'accepts_ros_args'):
         return nullcontext()
     from gp_ground_seg.cli.options import note
 
@@ -151,8 +142,6 @@ def _run(words: list[str]) -> int:
     try:
         with _interruptible():
             arguments = _parse(words)
-            if not _is_node(arguments):  # that runs for days
-                gc.set_threshold(COLLECT_AFTER)
             with _notes(arguments):
                 code: int = arguments.run(arguments)
     finally:
