@@ -1,7 +1,6 @@
 """``kitti-to-bag``: a sequence in SemanticKITTI layout as a rosbag2."""
 
 import functools
-import re
 from datetime import datetime, timezone
 
 import bag_samples as samples
@@ -22,14 +21,13 @@ convert = functools.partial(cli_runner.run, 'kitti-to-bag')
 
 
 def write_sequence(root, n_labelled=5, times=TIMES):
-    folder = root / 'sequences' / '04'
     for k in range(5):
         scan = samples.scan(k)
         semantic_and_instance = np.arange(len(scan), dtype='<u4') % 260 + (7 << 16)
         write_frame(root, '04', k, scan, semantic_and_instance if k < n_labelled else None)
     if times is not None:
-        (folder / 'times.txt').write_text(''.join(f'{time:e}\n' for time in times))
-    return folder
+        text = ''.join(f'{time:e}\n' for time in times)
+        (root / 'sequences/04/times.txt').write_text(text)
 
 
 def read_clouds(path):
@@ -73,18 +71,8 @@ def test_sequence_as_bag(tmp_path, capsys, name, storage, times):
             np.testing.assert_array_equal(label, np.arange(1801) % 260)
 
 
-@pytest.mark.parametrize(
-    ('times', 'sequence', 'message'),
-    [
-        (TIMES, '99', r'sequences/99: no velodyne folder.*sequences here: 04'),
-        ([0, 0.1, 0.2, 0.3, 1e10], '04', r'sequence 04: 0 to 1e\+10 s: no stamps of ROS'),
-        (None, '04', r'000003\.label: 8 bytes, expected 7204'),
-    ],
-)
-def test_refused(tmp_path, capsys, times, sequence, message):
-    folder = write_sequence(tmp_path / 'kitti', times=times)
-    if times is None:
-        (folder / 'labels/000003.label').write_bytes(b'0' * 8)
-    assert convert(tmp_path / 'kitti', tmp_path / 'out.db3', '--sequence', sequence) == 2
-    assert re.search(message, cli_runner.error_line(capsys))
+def test_times_that_no_stamp_holds_are_refused(tmp_path, capsys):
+    write_sequence(tmp_path / 'kitti', times=[0, 0.1, 0.2, 0.3, 1e10])
+    assert convert(tmp_path / 'kitti', tmp_path / 'out.db3', '--sequence', '04') == 2
+    assert 'sequence 04: 0 to 1e+10 s: no stamps of ROS' in cli_runner.error_line(capsys)
     assert [path.name for path in tmp_path.iterdir()] == ['kitti']
