@@ -118,11 +118,8 @@ def runner(arguments: argparse.Namespace, title: str) -> AbstractContextManager[
 
 def above_zero(text: str, *, or_zero: bool = False) -> float:
     """Read a number above 0, or 0."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not (math.isfinite(number) and (number > 0.0 or (or_zero and number == 0.0))):
+    number = float(text)
+    if not (0.0 < number < math.inf or (or_zero and number == 0.0)):
         least = 'at least 0' if or_zero else 'above 0'
         raise argparse.ArgumentTypeError(f'{text!r}: must be a number, {least}')
     return number

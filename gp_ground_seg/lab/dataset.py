@@ -139,8 +139,7 @@ def find_left(
         return items
     begun = changed_at(folder / PARAMETERS)
     if parameters is None or not begun:
-        n_there = f' ({len(there)} of {len(outputs)} files to write do)' * (len(outputs) > 1)
-        raise DataError(f'{there[0]}: exists already{n_there}; --force replaces it')
+        raise DataError(f'{there[0]}: exists already; --force replaces it')
     if said := find_difference(folder, parameters):
         raise DataError(f'{said}; give another output folder, or --force to start anew')
     return [item for item in items if not _is_finished(folder, item, begun)]
