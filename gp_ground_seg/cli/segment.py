@@ -207,8 +207,7 @@ def _print_summary(found: Sequence[Outcome], target: Path, n_workers: int = 0) -
         f'{options.count(len(found), "frame")}, {options.count(n_points, "point")}, '
         f'{share}, {pace}, segmentation only){beside}, written to {shown(target)}'
     )
-    if found:
-        print(_pose_summary([one.measured for one in found if one.measured is not None]))
+    print(_pose_summary([one.measured for one in found if one.measured is not None]))
     if contradictions := [text for one in found for text in one.contradictions]:
         n_frames = options.count(len(contradictions), 'frame')
         print(f'{shown(contradictions[0])} ({n_frames}: docs/pose.md)')
