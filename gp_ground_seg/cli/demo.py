@@ -52,7 +52,7 @@ EXAMPLES = f"""\
   gp-ground-seg demo --frames 100 --output big_demo
 
 Writes into the output folder: {BAG} (what was played), {PICTURE} (ground,
-obstacles and the errors of the last), {LOG} (what the node said).
+obstacles and the errors of the last scan), {LOG} (what the node said).
 
 exit code: 0, 1 if points were lost, 2 for an error, 130 when interrupted
 """
