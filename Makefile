@@ -53,9 +53,9 @@ test: $(VENV)/.dev
 	$(BIN)/gp-ground-seg warm-up
 	$(WITH_KITTI) $(BIN)/python -m pytest -n 2 --dist loadfile --timeout=300 -m 'not slow'
 
-test-all: $(VENV)/.dev
-	$(BIN)/gp-ground-seg warm-up
-	$(WITH_KITTI) $(BIN)/python -m pytest --timeout=1500
+# The slow ones run one after the other: some measure time and memory.
+test-all: test
+	$(WITH_KITTI) $(BIN)/python -m pytest --timeout=1500 -m slow
 
 chromium:
 	@command -v chromedriver >/dev/null \

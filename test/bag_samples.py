@@ -6,8 +6,7 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gp_ground_seg.data.bag_files import POINT_CLOUD2
-from gp_ground_seg.data.bags import BagWriter, encode_cloud, jazzy_types
+from gp_ground_seg.data.bags import POINT_CLOUD2, BagWriter, encode_cloud, jazzy_types
 
 START = 1_317_000_000_123_456_789
 PERIOD = 100_000_000

@@ -1,16 +1,20 @@
-"""Files as drivers, recorders and other programs write them, each with what is read of it.
+"""Files as drivers, recorders and other programs write them, or as nobody should.
 
-`CASES`: name -> (bytes, or a function that writes a bag; names of the fields, or topic and number
-of clouds, or the line that refuses it). The points are `XYZ`, in bags three clouds of them.
+`CASES`: name -> (bytes, or a function that writes a bag, or None for no file; names of the fields,
+or topic and number of clouds, or the line that refuses it). The points are `XYZ`, in bags three
+clouds of them.
 """
 
+import io
 import struct
+import zipfile
 
+import bag_samples as samples
+import lzf
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
-from gp_ground_seg.data.bag_files import POINT_CLOUD2
-from gp_ground_seg.data.bags import BagWriter, cloud_from_columns, encode_cloud
+from gp_ground_seg.data.bags import POINT_CLOUD2, BagWriter, cloud_from_columns, encode_cloud
 
 XYZ = np.arange(12, dtype='f4').reshape(4, 3)
 RAW = XYZ.tobytes()
@@ -32,6 +36,47 @@ def rows(*columns):
     return np.hstack(parts).tobytes()
 
 
+# No format, and those of numpy.
+
+
+def npy(array, **options):
+    file = io.BytesIO()
+    np.save(file, array, **options)
+    return file.getvalue()
+
+
+def npy_header(shape):
+    file = io.BytesIO()
+    layout = {'descr': '<f4', 'fortran_order': False, 'shape': shape}
+    np.lib.format.write_array_header_1_0(file, layout)
+    return file.getvalue()
+
+
+def npz(**members):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, 'w', zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(f'{name}.npy', data)
+    return file.getvalue()
+
+
+NESTED = npy(np.zeros(4, [('p', [('x', 'f4'), ('y', 'f4')])]))
+CASES |= {
+    'missing.npy': (None, 'no such file or folder'),
+    'notes.docx': (b'hello', r'not a scan or bag; accepted are \.bin, \.pcd'),
+    'points.xyz': (b'1 2 3', 'of a text, save x, y, z as .npy'),
+    'odd.bin': (bytes(17), '17 bytes is not a whole number of points of 4 float32'),
+    'objects.npy': (npy(np.array([{}, 1]), allow_pickle=True), 'Object arrays cannot be'),
+    'shape.npy': (npy_header((9999999999, 3)), r'cannot be read as \.npy \('),
+    'columns.npy': (npy_header((0, 10**12)), '1000000000000 numbers per point'),
+    'turned.npy': (npy(np.zeros((3, 200), 'f4')), r'\(3, 200\): is transposed'),
+    'nested.npy': (NESTED, r'no field x of one number per point; fields: p \(4,\)'),
+    'flat.npy': (npy(np.arange(9.0)), r'array of shape \(9,\): must be \(N, 3\)'),
+    'shape.npz': (npz(a=npy_header((10**9, 3)) + bytes(10**6)), r'cannot be read as \.npz \('),
+    'names.npz': (npz(a=npy(XYZ), b=npy(XYZ)), r'arrays a \(4, 3\), b \(4, 3\):'),
+}
+
+
 # PCD.
 
 
@@ -50,10 +95,24 @@ def ring_pcd(body, kind='U', name='ring', data='ascii'):
     return pcd(f'x y z {name}', '4 4 4 2', f'F F F {kind}', data, body)
 
 
+def many(n, body=RAW, data='binary', n_bytes=12):
+    """A PCD of so many points in its header, `n_bytes` each unpacked."""
+    if data == 'binary_compressed':
+        packed = lzf.compress(bytes(n_bytes))
+        body = struct.pack('<II', len(packed), min(n * n_bytes, 2**32 - 1)) + packed
+    return pcd(data=data, body=body, WIDTH=n, POINTS=n)
+
+
+def four(size='4', count='1', **lines):
+    """A binary PCD with a fourth field of this size and count."""
+    count = f'1 1 1 {count}'
+    return pcd('x y z a', f'4 4 4 {size}', 'F F F F', 'binary', RAW, COUNT=count, **lines)
+
+
 CASES |= {
     'plain.pcd': (pcd(), 'x y z'),
     'one_point.pcd': (pcd(body=text_of(XYZ[:1]), WIDTH='1', POINTS='1'), 'x y z'),
-    'no_point.pcd': (pcd(body=b'', WIDTH='0', POINTS='0'), 'x y z'),
+    'no_point.pcd': (pcd(body=b'', WIDTH='0', POINTS='0'), 'no points in it'),
     'binary.pcd': (pcd(data='binary', body=RAW), 'x y z'),
     'columns.pcd': (pcd(data='BINARY', body=RAW).replace(b'FIELDS', b'COLUMNS'), 'x y z'),
     'no_width.pcd': (pcd(WIDTH=None, HEIGHT=None), 'x y z'),
@@ -68,7 +127,7 @@ CASES |= {
     'capitals.pcd': (pcd(fields='X Y Z', data='binary', body=RAW), 'X Y Z'),
     'x_twice.pcd': (ring_pcd(rows(RING), name='x', data='binary'), 'x y z x_2'),
     'unknown_type.pcd': (ring_pcd(rows(RING), 'S'), 'field ring: no type S of 2 bytes'),
-    'word.pcd': (ring_pcd(with_ring(*'abcd')), 'x y z'),
+    'word.pcd': (ring_pcd(with_ring(*'abcd')), 'x y z ring'),
     'empty_lines.pcd': (pcd(body=text_of(XYZ).replace(b'\n', b'\n\n') + b' \n'), 'x y z'),
     'byte_order_mark.pcd': (b'\xef\xbb\xbf# .PCD v0.7\n\n' + pcd(), 'x y z'),
     'crlf.pcd': (pcd().replace(b'\n', b'\r\n'), 'x y z'),
@@ -76,6 +135,22 @@ CASES |= {
     'cut_text.pcd': (pcd(body=text_of(XYZ)[:-14]), 'truncated?'),
     'space_in_a_name.pcd': (pcd('x y z my ring', '4 4 4 2', 'F F F U', COUNT=None), r'a name\?'),
     'no_fields.pcd': (pcd(FIELDS=None), 'no FIELDS line'),
+    'none.pcd': (b'no header', 'no DATA line'),
+    'commas.pcd': (pcd(body=4 * b'0,1,2\n'), 'a line of 1 words, its header says 3, separated by'),
+    'sizes.pcd': (pcd(WIDTH='9'), '4 points, which is not width 9'),
+    'many.pcd': (many(8000000), '8000000 points'),
+    'packed.pcd': (
+        many(40000000, data='binary_compressed'), 'packed bytes cannot hold the 480000000 of its'
+    ),
+    'lzf.pcd': (many(400000000, data='binary_compressed'), 'its header says 4800000000'),
+    'wide.pcd': (four(count='500000000', WIDTH='0', POINTS='0'), '500000003 numbers per point'),
+    'bytes.pcd': (
+        four('8', count='900000000', WIDTH='0', POINTS='0').replace(b' a\n', b' _\n'),
+        '7200000012 bytes per point',
+    ),
+    'count.pcd': (four(count='9' * 11), 'COUNT 99999999999: must be a whole number, at most 4'),
+    'type.pcd': (pcd(types='X F F'), 'field x: no type X of 4 bytes'),
+    'data.pcd': (pcd(data='other'), 'DATA other: must be'),
 }  # fmt: skip
 
 
@@ -125,12 +200,17 @@ CASES |= {
     'nan_of_windows.ply': (
         ply(',float i', with_ring('-nan(ind)', '1.#QNAN', '-1.#IND', 3)), 'x y z i'
     ),
-    'word.ply': (ply(',float i', with_ring('a', 1, 2, 3)), 'x y z'),
+    'word.ply': (ply(',float i', with_ring('a', 1, 2, 3)), 'x y z i'),
     'crlf_binary.ply': (ply(body=b'', form=LE).replace(b'\n', b'\r\n') + RAW, 'x y z'),
     'umlaut.ply': (ply(',ushort höhe', rows(RING), LE), 'x y z höhe'),
     'latin1.ply': (ply().replace(b'made up', b'\xfcber'), 'x y z'),
     'no_vertices.ply': (
         ply().replace(b'vertex', b'points'), 'no PLY with vertices as its first element'
+    ),
+    'element.ply': (ply().replace(b'vertex 4', b'vertex'), 'element vertex : must have'),
+    'many.ply': (ply(form=LE, body=bytes(48)).replace(b'x 4', b'x 4000000'), '4000000 points'),
+    'lists.ply': (
+        ply(',list uchar int a', bytes(48), BE).replace(b'x 4', b'x 4000000000'), 'truncated?'
     ),
 }  # fmt: skip
 
@@ -171,8 +251,39 @@ def damaged(change):
     return write
 
 
+def with_one(**changes):
+    """Function that writes a bag with one cloud, which is not as it says."""
+
+    def write(path):
+        points = samples.cloud()
+        for name, value in changes.items():
+            setattr(points, name, value)
+        with BagWriter(path) as bag:
+            bag.add_topic('/points')
+            bag.write('/points', 0, encode_cloud(points))
+
+    return write
+
+
+def write_long_record(path):
+    """Write a bag with a first record that is said to have 3 GB."""
+    samples.write_ros1_bag(path)
+    with open(path, 'r+b') as file:
+        file.seek(len('#ROSBAG V2.0\n'))
+        file.write(struct.pack('<I', 3_000_000_000))
+
+
+WIDE_FIELDS = samples.cloud().fields
+WIDE_FIELDS[3].count = 400_000_000
+WIDE = {'width': 0, 'data': np.zeros(0, np.uint8), 'row_step': 0, 'fields': WIDE_FIELDS}
+NO_BAG = 'cannot be read as a bag; '
 THREE = '/points 3'
 CASES |= {
+    **{f'hello.{end}': (b'hello', NO_BAG) for end in ('mcap', 'bag', 'db3')},
+    **{f'empty.{end}': (b'', NO_BAG) for end in ('mcap', 'bag', 'db3')},
+    'points.mcap': (with_one(width=400_000_000), 'bytes: must be at least 8800000000'),
+    'wide.db3': (with_one(**WIDE), '400000004 numbers per point'),
+    'record.bag': (write_long_record, NO_BAG),
     'plain.mcap': (mcap(), THREE),
     'lz4.mcap': (mcap(compression=CompressionType.LZ4), THREE),
     'no_chunks.mcap': (mcap(times=(2, 0, 1), use_chunking=False), THREE),

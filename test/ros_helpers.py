@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -35,42 +36,32 @@ from sensor_msgs.msg import PointCloud2, PointField
 from gp_ground_seg.core.backend import choose_backend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.ros.loader import CHANGED, FOLLOWS
-from gp_ground_seg.ros.node import GroundSegmentationNode, main
+from gp_ground_seg.ros.node import GroundSegmentationNode
 
 # Other tests run beside this one, also as workers of pytest-xdist; nothing of them must be heard.
 _WORKER = os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw')
 _SESSION = os.getppid() if _WORKER else os.getpid()
-DOMAIN_ID = 1 + (4 * _SESSION + int(_WORKER or 0)) % 100
 NAMESPACE = f'/test_{_SESSION}'
 ISOLATION = {
     'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-    'ROS_DOMAIN_ID': str(DOMAIN_ID),
+    'ROS_DOMAIN_ID': str(1 + (4 * _SESSION + int(_WORKER or 0)) % 100),
     'RCUTILS_COLORIZED_OUTPUT': '0',
 }
+os.environ.update(ISOLATION)
 
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 @contextlib.contextmanager
-def isolated(**changes):
-    """The environment of the domain of these tests, on this machine only."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in {**ISOLATION, **changes}.items():
-            patch.setenv(name, value)
-        yield
-
-
-@contextlib.contextmanager
 def isolated_context():
     """A context of that domain."""
     context = Context()
-    with isolated():
-        try:
-            rclpy.init(context=context, args=[], domain_id=DOMAIN_ID)
-            yield context
-        finally:
-            rclpy.try_shutdown(context=context)
+    rclpy.init(context=context, args=[])
+    try:
+        yield context
+    finally:
+        rclpy.try_shutdown(context=context)
 
 
 @contextlib.contextmanager
@@ -124,7 +115,7 @@ POINT = np.dtype({**_LAYOUT, 'itemsize': 64})
 """A point as a driver sends it: x not first, bytes that belong to no field."""
 
 
-def street(n_points, seed=0, n_invalid=0):
+def street(n_points, seed=0):
     """Level ground 1.73 m below the sensor with walls and poles on it, as structured points."""
     rng = np.random.default_rng(seed)
     points = np.zeros(n_points, POINT)
@@ -136,8 +127,6 @@ def street(n_points, seed=0, n_invalid=0):
     radius[is_wall] = rng.choice([8.0, 15.0, 25.0], is_wall.sum())
     z[is_wall] = rng.uniform(-1.0, 1.0, is_wall.sum())
     points['x'], points['y'], points['z'] = radius * np.cos(azimuth), radius * np.sin(azimuth), z
-    invalid = rng.choice(n_points, n_invalid, replace=False)
-    points['z'][invalid] = rng.choice([np.nan, np.inf, -np.inf], n_invalid)
     return points
 
 
@@ -176,14 +165,18 @@ def rows_of(message):
     return [data[start : start + step] for start in range(0, len(data), step)]
 
 
-ENTRY_POINT = ('-c', 'import sys; from gp_ground_seg.cli.node import main; sys.exit(main())')
-"""What the installed executable does."""
+_RUN = "import sys; sys.path.remove(''); from gp_ground_seg.cli.node import {0}; sys.exit({0}())"
+ENTRY_POINT, MANAGED = (('-c', _RUN.format(name)) for name in ('main', 'main_managed'))
+"""What the installed executables do; the first of sys.path is their folder."""
+SOON = 4.0
+"""Time of the cloud at hand, and what a machine that does other things adds to it [s]."""
 MODULE = ('-m', 'gp_ground_seg', 'node')
 IN_NAMESPACE = ('--ros-args', '-r', f'__ns:={NAMESPACE}')
 
 
 def given(values):
-    """Words that give parameters their values."""
+    """Words that give parameters their values; diagnostics come often unless they say else."""
+    values = {'diagnostics.period': 0.1, **values}
     return [word for k, v in values.items() for word in ('-p', f'{k}:={str(v).lower()}')]
 
 
@@ -195,7 +188,7 @@ class Process:
         with self._log.open('wb') as log:
             self.popen = subprocess.Popen(
                 command or [sys.executable, *start, *words],
-                env={**os.environ, **ISOLATION, **environment},
+                env={**os.environ, **environment},
                 stdout=subprocess.DEVNULL, stderr=log,
             )  # fmt: skip
 
@@ -221,39 +214,43 @@ class Process:
         code = self.popen.wait(PATIENCE)
         return code, time.monotonic() - start
 
+    def end_well(self, number=signal.SIGINT):
+        """Send a signal, at which a node ends soon, with the cloud at hand, and says nothing."""
+        code, seconds = self.stop(number)
+        assert code == 0 and seconds < SOON, self.log
+        assert 'Traceback' not in self.log and 'ERROR' not in self.log
+
     def __enter__(self):
         return self
 
     def __exit__(self, *_error):
         self.popen.terminate()
-        try:
+        with contextlib.suppress(subprocess.TimeoutExpired):
             self.popen.wait(10.0)
-        except subprocess.TimeoutExpired:
-            self.popen.kill()
-            self.popen.wait()
+        self.popen.kill()  # does nothing to a process that has ended
+        self.popen.wait()
 
 
 @contextlib.contextmanager
 def stderr_in(folder):
-    """File of what this process writes to stderr meanwhile; shown after it.
+    """A function that returns what this process writes to stderr meanwhile, once it has all texts.
 
     A look at what capfd has empties it, and loses the line that a thread writes just then.
     """
     path, kept = folder / 'stderr', os.dup(2)
+
+    def said(*texts):
+        wait_for(lambda: all(text in path.read_text() for text in texts), f'{texts} on stderr')
+        return path.read_text()
+
     try:
         with path.open('a') as file:
             os.dup2(file.fileno(), 2)
-        yield path
+        yield said
     finally:
         os.dup2(kept, 2)
         os.close(kept)
         sys.stderr.write(path.read_text())
-
-
-def said_by(stderr, *texts):
-    """What is in the file `stderr`, once that holds all `texts`."""
-    wait_for(lambda: all(text in stderr.read_text() for text in texts), f'{texts} on stderr')
-    return stderr.read_text()
 
 
 def values_of(status):
@@ -300,13 +297,9 @@ class Link:
         wait_for(lambda: self.publisher.publish(message) or condition(), what)
 
     def set(self, name, value):
-        """Result of ``ros2 param set``."""
-        return self.load({name: value})[0]
-
-    def refusal(self, name, value):
-        """Reason for which a value is refused."""
-        result = self.set(name, value)
-        assert not result.successful
+        """Reason for which ``ros2 param set`` is refused; empty if it is not."""
+        (result,) = self.load({name: value})
+        assert result.successful != bool(result.reason)
         return result.reason
 
     def load(self, values):
@@ -328,6 +321,16 @@ class Link:
         wait_for(future.done, f'answer of {name}')
         return future.result()
 
+    def forget(self, collector):
+        """End what `collector` listens to."""
+        self.in_executor(self.probe.destroy_subscription, collector.subscription)
+
+    def in_executor(self, function, *arguments):
+        """Result of a call made between two waits, where entities may safely go."""
+        task = self.probe.executor.create_task(function, *arguments)
+        wait_for(task.done, 'turn of the executor')
+        return task.result()
+
     def wait_for_status(self, task, is_wanted):
         """Return the first status of the node's `task`, from now on, that is wanted.
 
@@ -346,10 +349,9 @@ class Link:
 class Bench(Link):
     """The node under test in this process, beside the probe that talks to it."""
 
-    def __init__(self, context, *words):
-        cli_args = ['--ros-args', '-r', f'__ns:={NAMESPACE}', *words]
+    def __init__(self, context, values):
+        cli_args = [*IN_NAMESPACE, *given(values)]
         self.node = GroundSegmentationNode(context=context, cli_args=cli_args)
-        self.node_name = self.node.get_fully_qualified_name()
         super().__init__(context)
 
     def wait_until_settled(self):
@@ -359,10 +361,14 @@ class Bench(Link):
 
     def listen(self, topic, message_type=PointCloud2):
         """A `Collector` of an optional output, once the node knows of it and of no other."""
-        publisher = next(p for o, p in self.node._outputs._publishers if o.topic == topic)
-        wait_for(lambda: publisher.get_subscription_count() == 0, f'end of ears of {topic}')
+        optional = [p for o, p in self.node._outputs._publishers if o.is_optional]
+
+        def wait_until_heard(n):
+            wait_for(lambda: sum(p.get_subscription_count() for p in optional) == n, f'{n} ears')
+
+        wait_until_heard(0)
         collector = Collector(self.probe, message_type, topic.replace('~', NODE_NAME))
-        wait_for(lambda: publisher.get_subscription_count() == 1, f'ear of {topic}')
+        wait_until_heard(1)
         return collector
 
     @contextlib.contextmanager
@@ -373,18 +379,12 @@ class Bench(Link):
         yield
         self.load(before)
 
-    def in_executor(self, function, *arguments):
-        """Result of a call made between two waits, where entities may safely go."""
-        task = self.node.executor.create_task(function, *arguments)
-        wait_for(task.done, 'turn of the executor')
-        return task.result()
-
 
 @contextlib.contextmanager
-def bench(*words, settled=True):
-    """A connected `Bench`, the node started with ``--ros-args words``."""
+def bench(values=None, settled=True):
+    """A connected `Bench`, the node with these values of parameters."""
     with isolated_context() as context:
-        b = Bench(context, *words)
+        b = Bench(context, values or {})
         with spinning(context, b.node, b.probe):
             b.wait_until_connected()
             if settled:
@@ -393,21 +393,22 @@ def bench(*words, settled=True):
 
 
 @contextlib.contextmanager
-def linked(sends=RELIABLE):
-    """A connected `Link` to a node of another process."""
+def linked(sends=RELIABLE, connected=True):
+    """A `Link` to a node of another process, connected unless that does not listen yet."""
     with isolated_context() as context:
         link = Link(context, sends)
         with spinning(context, link.probe):
-            link.wait_until_connected()
+            if connected:
+                link.wait_until_connected()
             yield link
 
 
 @contextlib.contextmanager
-def linked_process(folder, *words, sends=RELIABLE, **environment):
+def linked_process(folder, values, connected=True, **options):
     """A `Process` in our namespace, and a `Link` to it."""
-    with Process(*IN_NAMESPACE, *words, folder=folder, **environment) as node:
+    with Process(*IN_NAMESPACE, *given(values), folder=folder, **options) as node:
         node.wait_until_ready()
-        with linked(sends) as link:
+        with linked(connected=connected) as link:
             yield node, link
 
 
@@ -418,15 +419,3 @@ def started_node(*words):
         node = GroundSegmentationNode(context=context, cli_args=['--ros-args', *words])
         with spinning(context, node):
             yield node
-
-
-def start_error(capfd, *words):
-    """Line that the node ends with when it refuses to start with ``--ros-args words``."""
-    # The domain may be what is wrong.
-    with isolated(ROS_DOMAIN_ID=os.environ.get('ROS_DOMAIN_ID', str(DOMAIN_ID))):
-        assert main(['--ros-args', *words]) == 2
-    said = capfd.readouterr()
-    assert said.out == '' and 'Traceback' not in said.err
-    line = said.err.splitlines()[-1]
-    assert line.startswith('ground_segmentation_node: error: ')
-    return line

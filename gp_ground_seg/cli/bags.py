@@ -12,8 +12,13 @@ import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
-from gp_ground_seg.data.bag_files import POINT_CLOUD2
-from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_from_columns, encode_cloud
+from gp_ground_seg.data.bags import (
+    POINT_CLOUD2,
+    BagReader,
+    BagWriter,
+    cloud_from_columns,
+    encode_cloud,
+)
 from gp_ground_seg.data.point_cloud2 import CloudMessage
 from gp_ground_seg.data.semantic_kitti import list_frames
 from gp_ground_seg.ros.session import Session, large_cloud_transport, needing_ros, ros_session

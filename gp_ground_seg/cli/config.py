@@ -14,34 +14,30 @@ EXAMPLES = """\
   gp-ground-seg config dump > my.yaml            every parameter, explained, with its default
   gp-ground-seg config dump --config my.yaml --set label.ground_tolerance=0.15
   gp-ground-seg config dump --preset paper       those of the paper, with the reasons
-  gp-ground-seg config check my.yaml             unknown names, types, ranges
 """
-
-CHECK = """\
+DUMP = 'print the effective parameters as a ROS parameter file'
+CHECK = 'say everything that is wrong with a parameter file'
+CHECK_DESCRIPTION = """\
 Check names, types, ranges and the rules between parameters, and say who reads the
 file: commands read bare groups too, the node only the form of ROS (/**:
 ros__parameters:). Exit code 2 if anything is wrong.
+"""
+CHECK_EXAMPLES = """\
+  gp-ground-seg config check my.yaml             unknown names, types, ranges
 """
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and its subcommands."""
     description = 'Show the parameters, their units and ranges.'
-    parser = options.new_parser(subparsers, 'config', description, EXAMPLES)
+    parser = options.new_parser(subparsers, 'config', description, EXAMPLES + CHECK_EXAMPLES)
     commands = parser.add_subparsers(metavar='WHAT', required=True)
-    added = {}
-    for run, purpose, text in (
-        (run_dump, 'print the effective parameters as a ROS parameter file', ''),
-        (run_check, 'say everything that is wrong with a parameter file', CHECK),
-    ):
-        name = run.__name__.removeprefix('run_')
-        examples = [line for line in EXAMPLES.splitlines() if f'config {name}' in line]
-        added[name] = options.new_parser(
-            commands, name, text or purpose, '\n'.join(examples), purpose
-        )
-        added[name].set_defaults(run=run)
-    options.add_config(added['dump'])
-    added['check'].add_argument('files', metavar='FILE', nargs='+', help='parameter file (YAML)')
+    parser = options.new_parser(commands, 'dump', DUMP, EXAMPLES, DUMP)
+    options.add_config(parser)
+    parser.set_defaults(run=run_dump)
+    parser = options.new_parser(commands, 'check', CHECK_DESCRIPTION, CHECK_EXAMPLES, CHECK)
+    parser.add_argument('files', metavar='FILE', nargs='+', help='parameter file (YAML)')
+    parser.set_defaults(run=run_check)
 
 
 def run_dump(arguments: argparse.Namespace) -> int:

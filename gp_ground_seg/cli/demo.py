@@ -42,7 +42,7 @@ LAST_LINES = 20
 DESCRIPTION = f"""\
 Show the node at work without data: simulate a short drive along a street, write it as a bag,
 start the node in a second process, send the scans of the bag to it through ROS, receive both
-clouds, score the labels against the truth, and draw one scan with its errors. A scan is sent
+clouds, score the labels against the truth, and draw the last with its errors. A scan is sent
 when the last one is back, at most {1.0 / PERIOD:g} in a second.
 
 Its topics are in a namespace of a random name: other nodes are not disturbed.
@@ -52,7 +52,7 @@ EXAMPLES = f"""\
   gp-ground-seg demo --frames 100 --output big_demo
 
 Writes into the output folder: {BAG} (what was played), {PICTURE} (ground,
-obstacles and the errors of one scan), {LOG} (what the node said).
+obstacles and the errors of the last scan), {LOG} (what the node said).
 
 exit code: 0, 1 if points were lost, 2 for an error, 130 when interrupted
 """
@@ -139,7 +139,7 @@ def run(arguments: argparse.Namespace) -> int:
             _write(n_frames, folder / BAG, session)
             try:
                 with BagReader(folder / BAG) as bag:
-                    tally, (xyz, label, truth) = _play(bag, n_frames, session, node)
+                    tally = _play(bag, n_frames, session, node)
             except GroundSegError as error:
                 print('the last lines of the log of the node:', *node.log_lines()[-LAST_LINES:],
                       sep='\n  ', file=sys.stderr)  # fmt: skip
@@ -147,11 +147,11 @@ def run(arguments: argparse.Namespace) -> int:
                     f'{error}; {folder} has the bag and the log; try again with --force: what was '
                     'compiled is kept'
                 ) from error
-        number = n_frames // 2 + 1
-        title = f'Simulated street, scan {number} of {n_frames}'
-        counts = plot_scan_view(xyz, label, folder / PICTURE, title, truth=truth)
+        title = f'Simulated street, scan {n_frames}'
+        path = folder / PICTURE
+        counts = plot_scan_view(tally.xyz, tally.label, path, title, truth=tally.truth)
     print(f'\n{tally.summary()}\n')
-    print(f'picture  {folder / PICTURE}  scan {number}: {counts}')
+    print(f'picture  {path}  scan {n_frames}: {counts}')
     print(f'bag      {folder / BAG}  what was played; `gp-ground-seg play` plays it again')
     return 0 if tally.n_sent == tally.n_back else 1
 
@@ -170,22 +170,18 @@ def _write(n_frames: int, path: Path, session: Session) -> None:
             bar.update()
 
 
-def _play(
-    bag: BagReader, n_frames: int, session: Session, node: NodeProcess
-) -> tuple[Tally, tuple[npt.NDArray[np.floating], Labels, Labels]]:
-    """Send the scans of a bag to the node; return their sums, and the labels of one scan."""
+def _play(bag: BagReader, n_frames: int, session: Session, node: NodeProcess) -> Tally:
+    """Send the scans of a bag to the node."""
     print('[2/3] connecting to the node', flush=True)
     link = Link(session, node)
     link.connect(decode_cloud(next(bag.messages([TOPIC]))[2]))
     print('[3/3] sending the scans to the node, and receiving both clouds', flush=True)
     tally = Tally()
     with options.progress('scans')(total=n_frames) as bar:
-        for k, (_, _, raw) in enumerate(bag.messages([TOPIC])):
+        for _, _, raw in bag.messages([TOPIC]):
             cloud, started = decode_cloud(raw), time.monotonic()
             back = link.ask(cloud)
             tally.add(cloud, back, time.monotonic() - started, node.is_compiled())
-            if k == n_frames // 2:
-                shown = tally.xyz, tally.label, tally.truth
             bar.update()
             session.sleep(max(0.0, started + PERIOD - time.monotonic()))
-    return tally, shown
+    return tally

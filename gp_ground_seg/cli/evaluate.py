@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -65,6 +65,7 @@ KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI). W
 the scores are the same; the times are not, because frames are computed at the same time.
 """
 
+PEER = 'pypatchworkpp'
 ROOT = ('root', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'})
 OF_FRAMES = (
     ('--sequences', 'sequences, as in 00,08 (default: all)', {'metavar': 'LIST'}),
@@ -122,8 +123,7 @@ def run(arguments: argparse.Namespace) -> int:
         result.extend(_result_lines(scores))
         return tables.evaluation(scores, config)
 
-    packages = ['pypatchworkpp'] if arguments.peer else []
-    print_report(arguments, 'evaluate', measured, packages, data=arguments.root, cut=cut)
+    print_report(arguments, 'evaluate', measured, data=arguments.root, cut=cut)
     changes = [f'{name}={value}' for name, value in changed_parameters(config).items()]
     print('', f'parameters: {", ".join(changes) or "defaults"}', *result, sep='\n')
     return 0
@@ -133,20 +133,16 @@ def print_report(
     arguments: argparse.Namespace,
     title: str,
     measured: Callable[[Runner], Report],
-    packages: Sequence[str],
     **facts: Any,
 ) -> None:
-    """Measure with the runner of the options, write ``--json``, and print the tables.
-
-    The versions of `packages` are recorded, and the `facts`.
-    """
+    """Measure with the runner of the options, write ``--json`` with `facts`, print the tables."""
     if arguments.markdown:
         require('tabulate', 'tabulate')
     target = arguments.json
     with staged_file(target, force=arguments.force) if target else nullcontext() as path:
         with options.runner(arguments, title) as runner:
             report = measured(runner)
-        environment = {**describe_environment(*packages), 'n_workers': runner.n_workers}
+        environment = {**describe_environment(PEER), 'n_workers': runner.n_workers}
         if path is not None:
             report.write(path, environment, **facts)
     machine = machine_line(environment, report.backend)

@@ -5,16 +5,12 @@ from __future__ import annotations
 import argparse
 import inspect
 from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options, print_report
-from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.lab import experiments, table1
+from gp_ground_seg.lab import experiments
 from gp_ground_seg.lab.cluster import Runner
-from gp_ground_seg.lab.scenes import CROWDED, score_scenes, simulated_frames
 from gp_ground_seg.lab.scoring.report import Report
 from gp_ground_seg.lab.simulation import DRIVES, LOW, SCENES, SENSORS, STEEP
 
@@ -24,8 +20,6 @@ EXAMPLES = """\
   gp-ground-seg experiment scenes --sensors vlp-16 --scenes kerb
   gp-ground-seg experiment NAME --help          describes one of them
 """
-SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
-NO_PEER = ('--no-peer', 'leave Patchwork++ out (pip install pypatchworkpp)', options.FLAG)
 
 
 class Experiment(NamedTuple):
@@ -36,30 +30,23 @@ class Experiment(NamedTuple):
 
     run: Callable[..., Report]
     sensors: Sequence[str] = ()
-    scenes: Sequence[str] = (*DRIVES,)
-    n_seeds: int = 1  # scenes of each kind
-    places: Sequence[float] = (0.0,)  # of the sensor in each scene [m]
+    scenes: Sequence[str] = ()
+    n_seeds: int = 0  # scenes of each kind
+    places: Sequence[float] = ()  # of the sensor in each scene [m]
     labelled: bool = True  # whether it takes labelled frames
     is_timed: bool = False  # then it runs in one process
-    takes_config: bool = True  # whether its parameters can be set
-
-    @property
-    def has_peer(self) -> bool:
-        """Whether Patchwork++ can run beside it."""
-        return 'with_peer' in inspect.signature(self.run).parameters
 
 
 EXPERIMENTS = {
     'ablation': Experiment(
-        experiments.compare_models, THREE[:1], [experiments.SCENE], 10, experiments.PLACES
+        experiments.compare_models, THREE[:1], ['road_then_rubble'], 10, (0.0, 6.0, 12.0)
     ),
-    'steps': Experiment(experiments.compare_steps, takes_config=False),
+    'steps': Experiment(experiments.compare_steps),
     'pseudo-inputs': Experiment(experiments.compare_pseudo_inputs, is_timed=True),
     'scenes': Experiment(
-        score_scenes, THREE, (*DRIVES, *LOW, *STEEP), 3, places=(0.0, 6.0), labelled=False
+        experiments.score_scenes, THREE, (*DRIVES, *LOW, *STEEP), 3, (0.0, 6.0), labelled=False
     ),
-    'objects': Experiment(score_scenes, [*SENSORS], CROWDED, n_seeds=2, labelled=False),
-    'table1': Experiment(table1.table1, is_timed=True),
+    'table1': Experiment(experiments.table1, is_timed=True),
     'speed': Experiment(experiments.measure_speed, is_timed=True),
 }
 """Experiments by name. A new one is a row here and its function."""
@@ -76,14 +63,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         example = f'  gp-ground-seg experiment {name}{source} --json {name}.json'
         purpose = description.splitlines()[0].removesuffix('.')
         child = options.new_parser(names, name, f'{description}\n', example, purpose)
-        # What is not asked for: no labelled frames, no simulated scans, one process.
-        child.set_defaults(run=run, root=None, simulated=not experiment.labelled)
-        child.set_defaults(workers=None, scheduler=None)
+        child.set_defaults(run=run, root=None, workers=None, scheduler=None)
         if experiment.labelled:
             count = {'nargs': '?'} if experiment.sensors else {}
             options.add(child, (*ROOT[:2], {**ROOT[2], **count}), *OF_FRAMES)
-        if experiment.labelled and experiment.sensors:
-            options.add(child, SIMULATED)
         if experiment.sensors:
             n_seeds = f'scenes of each kind (default: {experiment.n_seeds})'
             options.add(child, ('--seeds', n_seeds, options.NUMBER))
@@ -94,38 +77,30 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                 text = f'some of {",".join(known)} (default: {",".join(default)})'
                 kind = {'metavar': 'LIST', 'type': options.some_of(known)}
                 options.add(child, (option, text, kind))
-        options.add(child, *[NO_PEER] * experiment.has_peer)
         options.add(child, options.MARKDOWN, options.TO_JSON, options.FORCE)
         if not experiment.is_timed:
             options.add_cluster(child)
-        if experiment.takes_config:
-            options.add_config(child)
+        options.add_config(child)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, write the file, print the tables."""
     name, experiment = arguments.experiment, EXPERIMENTS[arguments.experiment]
-    if arguments.simulated == (arguments.root is not None):
-        raise DataError(f'{name}: give either ROOT or --simulated')
-    others = ('sequences', 'frame_step') if arguments.simulated else ('sensors', 'scenes', 'seeds')
-    options.refuse(arguments, others, 'is for the other kind of scans, see --simulated')
-    config = options.read_config(arguments) if experiment.takes_config else Config()
-    measure: Callable[..., Report] = experiment.run
-    with_peer = experiment.has_peer and not arguments.no_peer
-    if experiment.has_peer:
-        measure = partial(measure, with_peer=with_peer)
+    config, is_simulated = options.read_config(arguments), arguments.root is None
+    others = ('sequences', 'frame_step') if is_simulated else ('sensors', 'scenes', 'seeds')
+    kind = 'labelled' if is_simulated else 'simulated'
+    options.refuse(arguments, others, f'is for {kind} scans')
 
     def measured(runner: Runner) -> Report:
-        if not arguments.simulated:
-            return measure(frames_from_options(arguments), config, runner)
-        scans: Sequence[Any] = simulated_frames(
+        if not is_simulated:
+            return experiment.run(frames_from_options(arguments), config, runner)
+        scans = experiments.simulated_frames(
             arguments.sensors or experiment.sensors,
             arguments.scenes or experiment.scenes,
             arguments.seeds or experiment.n_seeds,
             experiment.places,
         )
-        return measure(scans, config, runner)
+        return experiment.run(scans, config, runner)
 
-    packages = ['pypatchworkpp'] * with_peer
-    print_report(arguments, name, measured, packages, experiment=name)
+    print_report(arguments, name, measured, experiment=name)
     return 0

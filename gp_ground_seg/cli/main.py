@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import argparse
-import gc
 import importlib
 import io
 import logging
 import os
 import signal
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import NoReturn
 
 from gp_ground_seg import __version__
-from gp_ground_seg.core.errors import GroundSegError, in_one_line, reason_of, shown
-from gp_ground_seg.core.parameters.schema import did_you_mean
+from gp_ground_seg.core.errors import (
+    GroundSegError,
+    in_one_line,
+    messages_passed_to,
+    reason_of,
+    shown,
+)
 
 ROS_ARGS = '--ros-args'
-COLLECT_AFTER = 50_000
-"""New objects after which Python looks for garbage: compiling makes a million that stay, and with
-the usual 700 a tenth of its time goes into the search."""
 
 # Module in `gp_ground_seg.cli` and purpose of each command. The `add_parser(subparsers)` of a
 # module declares its commands: their options, and the default `run`, a function of the parsed
@@ -41,10 +41,9 @@ COMMANDS = {
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
 }
-GROUPS = {'robot': 'node', 'files': 'segment', 'laboratory': 'evaluate'}
-"""Groups of commands in the help, each with its first command."""
-
 EXAMPLES = """\
+`gp-ground-seg COMMAND --help` explains a command.
+
 examples:
   gp-ground-seg demo                             show the node at work, no data needed
   gp-ground-seg segment drive.mcap -o out.mcap   ground and obstacle clouds of a bag
@@ -53,24 +52,12 @@ examples:
 """
 
 
-def _grouped_commands() -> str:
-    """Return a line for each command, under the title of its group."""
-    titles = {first: title for title, first in GROUPS.items()}
-    lines = []
-    for name, (_, purpose) in COMMANDS.items():
-        if name in titles:
-            lines.append(f'{titles[name]}:')
-        lines.append(f'  {name:<14}{purpose}')
-    return '\n'.join(lines)
-
-
 class _Parser(argparse.ArgumentParser):
     """Raises what is wrong with the words as a GroundSegError of one line."""
 
     def error(self, message: str) -> NoReturn:
         """Raise a GroundSegError, which names the help."""
-        parts = [self.prog.partition(' ')[2], message.removeprefix('argument ')]
-        raise GroundSegError(f'{": ".join(filter(None, parts))}; {self.prog} --help explains it')
+        raise GroundSegError(f'{message.removeprefix("argument ")}; see {self.prog} --help')
 
 
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:
@@ -82,19 +69,13 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument('--version', action='version', version=__version__)
-    subparsers = parser.add_subparsers(
-        title='commands',
-        description=_grouped_commands(),
-        metavar='COMMAND',
-        help='explained by `gp-ground-seg COMMAND --help`',
-        required=True,
-    )
+    subparsers = parser.add_subparsers(title='commands', metavar='COMMAND', required=True)
     if command is not None:
         module = COMMANDS[command][0]
         importlib.import_module(f'gp_ground_seg.cli.{module}').add_parser(subparsers)
     else:
-        for name in COMMANDS:
-            subparsers.add_parser(name)
+        for name, (_, purpose) in COMMANDS.items():
+            subparsers.add_parser(name, help=purpose)
     return parser
 
 
@@ -102,31 +83,22 @@ def _parse(words: list[str]) -> argparse.Namespace:
     """Parse the words before ``--ros-args``; it and what follows is ROS's to read."""
     n_before = words.index(ROS_ARGS) if ROS_ARGS in words else len(words)
     command = next((word for word in words[:n_before] if not word.startswith('-')), None)
-    if command not in (None, *COMMANDS):
-        hint = did_you_mean(command or '', COMMANDS) or '; --help lists them'
-        raise GroundSegError(f'{command}: no such command{hint}')
-    arguments, unknown = build_parser(command).parse_known_args(words[:n_before])
-    takes_ros_args = getattr(arguments, 'accepts_ros_args', False)
-    if unknown:
-        hint = f'{ROS_ARGS} before what ROS reads, or ' if takes_ros_args else ''
-        raise GroundSegError(
-            f'{command}: unrecognized arguments: {" ".join(unknown)}; '
-            f'try {hint}gp-ground-seg {command} --help'
-        )
+    parser = build_parser(command if command in COMMANDS else None)
+    arguments = parser.parse_args(words[:n_before])
     arguments.ros_args = words[n_before:]
-    if arguments.ros_args and not takes_ros_args:
+    if arguments.ros_args and not hasattr(arguments, 'accepts_ros_args'):
         raise GroundSegError(f'{command}: {ROS_ARGS}: this command takes none')
     return arguments
 
 
 def _notes(arguments: argparse.Namespace) -> AbstractContextManager[None]:
     """Print what the library logs as notes, except in a node, which logs by way of ROS."""
-    if getattr(arguments, 'accepts_ros_args', False):
+    if hasattr(arguments, 'accepts_ros_args'):
         return nullcontext()
-    from gp_ground_seg.cli.options import library_notes
+    from gp_ground_seg.cli.options import note
 
-    quiet = getattr(arguments, 'quiet', False)
-    return library_notes(logging.WARNING if quiet else logging.INFO)
+    level = logging.WARNING if getattr(arguments, 'quiet', False) else logging.INFO
+    return messages_passed_to(lambda _, text: note(text), level)
 
 
 @contextmanager
@@ -136,9 +108,6 @@ def _interruptible() -> Iterator[None]:
     numba does either when SIGINT comes while it compiles or loads code. SIGINT counts also where
     it is ignored at the start, as in the background of a script: `kill -INT` ends a command there.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     is_interrupted = False
 
     def note(_number: int, _frame: object) -> None:
@@ -173,8 +142,6 @@ def _run(words: list[str]) -> int:
     try:
         with _interruptible():
             arguments = _parse(words)
-            if not getattr(arguments, 'accepts_ros_args', False):  # a node runs for days
-                gc.set_threshold(COLLECT_AFTER)
             with _notes(arguments):
                 code: int = arguments.run(arguments)
     finally:

@@ -3,31 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import math
 import sys
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, suppress
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from gp_ground_seg.core.errors import (
-    ConfigError,
-    DataError,
-    in_thousands,
-    messages_passed_to,
-    shown,
-)
+from gp_ground_seg.core.errors import ConfigError, DataError, in_thousands, shown
 from gp_ground_seg.core.jit import has_to_compile
 from gp_ground_seg.core.parameters.config import PRESETS, Config, find_preset
-from gp_ground_seg.core.parameters.schema import (
-    YAML_SUFFIXES,
-    did_you_mean,
-    load_yaml,
-)
+from gp_ground_seg.core.parameters.schema import load_yaml
 from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, MIN_COLUMNS
 from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.lab.cluster import Runner, open_runner
@@ -130,11 +118,8 @@ def runner(arguments: argparse.Namespace, title: str) -> AbstractContextManager[
 
 def above_zero(text: str, *, or_zero: bool = False) -> float:
     """Read a number above 0, or 0."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not (math.isfinite(number) and (number > 0.0 or (or_zero and number == 0.0))):
+    number = float(text)
+    if not (0.0 < number < math.inf or (or_zero and number == 0.0)):
         least = 'at least 0' if or_zero else 'above 0'
         raise argparse.ArgumentTypeError(f'{text!r}: must be a number, {least}')
     return number
@@ -145,12 +130,10 @@ def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:
     names = list(known)
 
     def parse(text: str) -> list[str]:
-        words = [word for word in text.split(',') if word]
-        unknown = next((word for word in words if word not in names), None)
-        if unknown or not words or len(set(words)) < len(words):
-            hint = did_you_mean(unknown, names) if unknown else ''
+        words = text.split(',')
+        if len({*words} & {*names}) < len(words):
             wanted = f'some of {",".join(names)}, each once'
-            raise argparse.ArgumentTypeError(f'{text!r}: must be {wanted}{hint}')
+            raise argparse.ArgumentTypeError(f'{text!r}: must be {wanted}')
         return words
 
     return parse
@@ -171,12 +154,8 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 def read_config(arguments: argparse.Namespace) -> Config:
     """Return the preset, changed by the file, changed by the settings."""
-    if arguments.preset.endswith(YAML_SUFFIXES):
-        raise ConfigError(f'--preset {arguments.preset}: is a file, which --config reads')
     config = find_preset(arguments.preset).config
     if arguments.config:
-        if arguments.config in PRESETS and not Path(arguments.config).exists():
-            raise ConfigError(f'--config {arguments.config}: is a preset, which --preset takes')
         config = Config.from_yaml(arguments.config, config)
     return config.replace(**dict(parse_setting(setting) for setting in arguments.settings))
 
@@ -213,11 +192,6 @@ def note(message: str) -> None:
     """Print a line on standard error that is neither result nor error."""
     with suppress(OSError):  # standard error may be full
         print(f'gp-ground-seg: note: {shown(message)}', file=sys.stderr)
-
-
-def library_notes(level: int = logging.INFO) -> AbstractContextManager[None]:
-    """Print what the library logs, such as that it compiles, as notes within the block."""
-    return messages_passed_to(lambda _, text: note(text), level)
 
 
 def count(number: int, noun: str) -> str:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import argparse
 import statistics
 from collections.abc import Sequence
-from contextlib import closing
 from functools import partial
 from itertools import chain
-from operator import attrgetter
 from pathlib import Path
 
 from gp_ground_seg import __version__
@@ -16,18 +14,18 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
-from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
+from gp_ground_seg.data.bags import BAG_SUFFIXES
 from gp_ground_seg.data.cloud_files import FORMATS, LABELS, format_for
-from gp_ground_seg.data.files import check_writable
+from gp_ground_seg.data.files import write_file
 from gp_ground_seg.data.inputs import Inputs, holds_bag, list_inputs
 from gp_ground_seg.data.semantic_kitti import is_root, list_sequences
 from gp_ground_seg.lab.dataset import (
     PARAMETERS,
     Item,
     Outcome,
-    OutputFolder,
     count_clouds,
+    find_difference,
+    find_left,
     segment_block,
     write_bag,
     write_scans,
@@ -63,7 +61,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Declare the commands."""
     parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
     parser.usage = '%(prog)s INPUT [BAG ...] [-o OUT] [options]'
-    formats = (*FORMATS, *SUFFIX_OF_STORAGE)
     options.add(
         parser,
         ('input', 'scan, folder of scans, bag, or a root', {'metavar': 'INPUT'}),
@@ -71,9 +68,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('-o --output', 'for scans a folder, or a file for a single scan; for bags a folder, or '
          'a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
          {'metavar': 'OUT'}),
-        ('--format', 'of the output (default: by the name of OUT, else labels of .bin scans, and '
-         f'as the input; mcap for ROS 1): {", ".join(formats)}',
-         {'choices': formats, 'metavar': 'FORMAT'}),
+        ('--format', 'of a file for each scan or cloud (default: by the name of OUT, else labels '
+         f'of .bin scans, and as the input): {", ".join(FORMATS)}',
+         {'choices': FORMATS, 'metavar': 'FORMAT'}),
         *options.CLOUDS,
         options.FORCE,
         options.QUIET,
@@ -86,104 +83,59 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(arguments: argparse.Namespace) -> int:
     """Write the files of each input that are not written yet, and print a summary."""
     config = options.read_config(arguments)
-    source = Path(arguments.input)
-    target = Path(arguments.output or _default_output(source, arguments.format))
-    if holds_bag(source):
-        options.refuse(arguments, ['columns'], f'is for .bin scans, which {source} is not')
-    else:
-        of_bags = ['topic', *['format'] * (arguments.format not in FORMATS)]
-        options.refuse(arguments, of_bags, f'is for bags, which {source} is not')
-    if arguments.more:
-        _segment_into(target, _list_bags(arguments), arguments, config)
-    elif holds_bag(source) and arguments.format not in FORMATS:
-        bag = _bag_item(source, target.name, arguments, force=arguments.force)
-        _segment_to(target, bag, arguments, config)
-    elif is_root(source):
-        _segment_into(target, _list_root(arguments), arguments, config)
-    else:
-        _segment_scans(target, arguments, config)
+    target = Path(arguments.output or _default_output(Path(arguments.input), arguments.format))
+    items, is_one = _list_items(arguments, target)
+    if not is_one and (target.is_file() or target.suffix[1:] in FORMATS):
+        raise DataError(f'{target}: must be a folder')
+    folder, place = (target.parent, target) if is_one else (target, target.resolve())
+    if not place.parent.is_dir():
+        raise DataError(f'{target}: the folder {place.parent} does not exist')
+    parameters = None if is_one else _parameters(arguments, config)
+    left = find_left(folder, items, parameters, force=arguments.force)
+    if len(left) < len(items):
+        print(f'{len(items) - len(left)} of {len(items)} were finished before')
+    if not left:
+        return 0
+    used = options.spare_compiling(config, count_clouds(left))
+    with options.runner(arguments, 'segment') as runner:
+        if parameters and (arguments.force or find_difference(folder, parameters)):
+            write_file(folder / PARAMETERS, parameters.encode())
+        found = runner.run(partial(segment_block, folder, used), left, size_of=count_clouds)
+    _print_summary([*chain(*found)], target, runner.n_workers)
+    if not arguments.quiet:
+        options.note_spared(config, used)
     return 0
 
 
-def _segment_scans(target: Path, arguments: argparse.Namespace, config: Config) -> None:
-    """Segment scans, or the clouds of a bag, into files."""
+def _list_items(arguments: argparse.Namespace, target: Path) -> tuple[list[Item], bool]:
+    """List what to segment, and say whether `target` is the one file or bag that it becomes."""
     source, form = Path(arguments.input), arguments.format
+    if arguments.more:
+        return _list_bags(arguments), False
+    if holds_bag(source) and form is None:
+        return [_bag_item(source, target.name, arguments)], True
+    if is_root(source):
+        return _list_root(arguments), False
     scans = options.list_clouds(arguments)
-    is_single = not (source.is_dir() or scans.topic)
-    if is_single and target.suffix[1:] in FORMATS:
-        if form not in (None, target.suffix[1:]):
-            raise DataError(f'{target}: ends in {target.suffix}, which is not {form}')
-        item = Item(source, [target.name], partial(write_scans, scans, [target.name]))
-        _segment_to(target, item, arguments, config)
-        return
-    if is_single and target.suffix and not target.is_dir():
+    if source.is_dir() or scans.topic:
+        return _scan_items(scans, form), False
+    suffix = target.suffix[1:]
+    if suffix in FORMATS:
+        if form not in (None, suffix):
+            raise DataError(f'{target}: ends in .{suffix}, which is not {form}')
+        return [Item(source, [target.name], partial(write_scans, scans, [target.name]))], True
+    if suffix and not target.is_dir():
         raise DataError(f'{target}: must be a folder, or end in .{", .".join(FORMATS)}')
-    _segment_into(target, _list_items(scans, form), arguments, config)
+    return _scan_items(scans, form), False
 
 
-def _list_items(scans: Inputs, form: str | None, folder: str = '') -> list[Item]:
+def _scan_items(scans: Inputs, form: str | None, folder: str = '') -> list[Item]:
     """List scans, which become files in a folder of the output; a bag is one item."""
     names = [f'{folder}{scan.name}.{format_for(scan.path, form)}' for scan in scans]
     if scans.topic:
         return [Item(scans.path, names, partial(write_scans, scans, names), len(scans))]
     pairs = zip(scans, names, strict=True)
     return [Item(s.path, [name], partial(write_scans, [s], [name])) for s, name in pairs]
-
-
-def _segment_to(target: Path, item: Item, arguments: argparse.Namespace, config: Config) -> None:
-    """Segment one input into one file or bag."""
-    options.refuse(arguments, ['workers', 'scheduler'], 'is for several inputs')
-    if target.resolve() == item.path.resolve():
-        raise DataError(f'{target}: is the input; name another output')
-    if target.suffix[1:] in FORMATS:
-        check_writable(target, force=arguments.force)
-    bar = options.progress('segment', quiet=arguments.quiet)
-    used = options.spare_compiling(config, item.n_clouds)
-    results = item.write(GroundSegmenter(used), target.parent)
-    _print_summary([*map(Outcome.of, bar(results, total=item.n_clouds))], target)
-    if not arguments.quiet:
-        options.note_spared(config, used)
-
-
-def _segment_into(
-    folder: Path, items: list[Item], arguments: argparse.Namespace, config: Config
-) -> None:
-    """Segment what is left of several inputs into a folder."""
-    if folder.suffix[1:] in FORMATS:
-        raise DataError(f'{folder}: must be a folder')
-    if not folder.resolve().parent.is_dir():
-        raise DataError(f'{folder}: the folder {folder.resolve().parent} does not exist')
-    title = f'written by gp-ground-seg segment {__version__}, from {_source(arguments)}'
-    for name in 'topic', 'columns':
-        title += f', {name} {value}' if (value := vars(arguments)[name]) else ''
-    force, begun = arguments.force, folder / PARAMETERS
-    if config.runtime.backend == 'auto' and begun.exists() and not force:
-        # What has been begun with numpy goes on with it, although compiled code may be there now.
-        used = config.replace(**{'runtime.backend': Config.from_yaml(begun).runtime.backend})
-    else:
-        used = options.spare_compiling(config, count_clouds(items))
-    # A bag takes long: each is a block by itself, and kept once it is finished.
-    group = attrgetter('path') if arguments.more else None
-    compute = partial(segment_block, folder, used)
-    with closing(OutputFolder(folder, f'# {shown(title)}\n{used.to_yaml()}')) as output:
-        left = output.find_left(items, force=force)
-        if len(left) < len(items):
-            print(f'{len(items) - len(left)} of {len(items)} were finished before')
-        if not left:
-            return
-        with options.runner(arguments, 'segment') as runner:
-            output.begin(force=force)
-            outcomes = runner.run(compute, left, group, count_clouds)
-    _print_summary([*chain(*outcomes)], folder, runner.n_workers)
-    if not arguments.quiet:
-        options.note_spared(config, used)
-
-
-def _source(arguments: argparse.Namespace) -> Path:
-    """Return where the inputs are: the same names from elsewhere are other inputs."""
-    source = Path(arguments.input).resolve()
-    is_whole = not arguments.more and (holds_bag(source) or source.is_dir())
-    return source if is_whole else source.parent
 
 
 def _list_root(arguments: argparse.Namespace) -> list[Item]:
@@ -193,13 +145,15 @@ def _list_root(arguments: argparse.Namespace) -> list[Item]:
         raise DataError(f'--format {arguments.format}: a KITTI_ROOT gives .label files')
     items = []
     for sequence in list_sequences(arguments.input):
-        scans = list_inputs(Path(arguments.input, 'sequences', sequence), columns)
-        items += _list_items(scans, LABELS, f'sequences/{sequence}/predictions/')
+        folder = Path(arguments.input, 'sequences', sequence)
+        scans = list_inputs(folder, columns, arguments.topic)
+        items += _scan_items(scans, LABELS, f'sequences/{sequence}/predictions/')
     return items
 
 
 def _list_bags(arguments: argparse.Namespace) -> list[Item]:
     """List several bags, each of which becomes one in the output folder."""
+    options.refuse(arguments, ['format'], 'is for scans, or for one bag')
     paths = [Path(source) for source in (arguments.input, *arguments.more)]
     for path in paths:
         if not holds_bag(path):
@@ -208,16 +162,26 @@ def _list_bags(arguments: argparse.Namespace) -> list[Item]:
     for name in names:
         if names.count(name) > 1:
             raise DataError(f'two of the bags would become {name}')
-    # What may be replaced is known by `OutputFolder`.
-    pairs = zip(paths, names, strict=True)
-    return [_bag_item(path, name, arguments, force=True) for path, name in pairs]
+    return [_bag_item(*pair, arguments) for pair in zip(paths, names, strict=True)]
 
 
-def _bag_item(path: Path, name: str, arguments: argparse.Namespace, *, force: bool) -> Item:
-    """Item of a bag that becomes the bag `name`, which is replaced with `force`."""
+def _bag_item(path: Path, name: str, arguments: argparse.Namespace) -> Item:
+    """Item of a bag that becomes the bag `name`."""
+    options.refuse(arguments, ['columns'], f'is for .bin scans, which {path} is not')
     n_clouds = len(list_inputs(path, topic=arguments.topic))
-    write = partial(write_bag, path, name, arguments.topic, arguments.format, force)
+    write = partial(write_bag, path, name, arguments.topic)
     return Item(path, [name], write, n_clouds)
+
+
+def _parameters(arguments: argparse.Namespace, config: Config) -> str:
+    """Return what the files of an output folder depend on, beside the content of the inputs."""
+    source = Path(arguments.input).resolve()
+    if arguments.more or not (source.is_dir() or holds_bag(source)):
+        source = source.parent  # the same names from elsewhere are other inputs
+    title = f'written by gp-ground-seg segment {__version__}, from {source}'
+    for name in 'topic', 'columns':
+        title += f', {name} {value}' if (value := vars(arguments)[name]) else ''
+    return f'# {shown(title)}\n{config.to_yaml()}'
 
 
 def _default_output(source: Path, form: str | None = None) -> Path:
@@ -226,7 +190,7 @@ def _default_output(source: Path, form: str | None = None) -> Path:
     if named.is_dir():
         return named.with_name(f'{named.name}_ground')
     suffix = '' if named.suffix in ('.bag', '.bin') else named.suffix
-    if form in FORMATS:
+    if form is not None:
         suffix = '' if named.suffix in BAG_SUFFIXES else f'.{form}'
     return named.with_name(f'{named.stem}_ground{suffix}')
 
@@ -236,15 +200,14 @@ def _print_summary(found: Sequence[Outcome], target: Path, n_workers: int = 0) -
     seconds = [one.seconds for one in found]
     n_points, n_ground = sum(one.n_points for one in found), sum(one.n_ground for one in found)
     share = f'{n_ground / n_points:.1%} ground' if n_points else 'no ground'
-    pace = f'{1e3 * statistics.median(seconds[1:] or seconds):.1f} ms'
-    pace += ' per frame (median' if len(seconds) > 1 else ' for the first frame (with loading code'
+    # The first may load code.
+    pace = f'{1e3 * statistics.median(seconds[1:] or seconds):.1f} ms per frame (median'
     beside = f' in each of {options.count(n_workers, "worker")}' if n_workers else ''
     print(
         f'{options.count(len(found), "frame")}, {options.count(n_points, "point")}, '
         f'{share}, {pace}, segmentation only){beside}, written to {shown(target)}'
     )
-    if found:
-        print(_pose_summary([one.measured for one in found if one.measured is not None]))
+    print(_pose_summary([one.measured for one in found if one.measured is not None]))
     if contradictions := [text for one in found for text in one.contradictions]:
         n_frames = options.count(len(contradictions), 'frame')
         print(f'{shown(contradictions[0])} ({n_frames}: docs/pose.md)')

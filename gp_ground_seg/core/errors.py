@@ -97,19 +97,11 @@ def log_once(level: int, text: str, *values: object) -> None:
         LOGGER.log(level, text, *values)
 
 
-class _Handler(logging.Handler):
-    def __init__(self, receive: Receive) -> None:
-        super().__init__()
-        self._receive = receive
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._receive(record.levelno, record.getMessage())
-
-
 @contextmanager
 def messages_passed_to(receive: Receive, level: int = logging.INFO) -> Iterator[None]:
     """Call `receive` with each message of that severity or more within the block."""
-    handler, before = _Handler(receive), LOGGER.level
+    handler, before = logging.Handler(), LOGGER.level
+    handler.emit = lambda record: receive(record.levelno, record.getMessage())  # type: ignore
     LOGGER.addHandler(handler)
     LOGGER.setLevel(level)
     try:

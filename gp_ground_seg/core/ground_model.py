@@ -64,13 +64,6 @@ class GroundModel:
         return cls(surface.knots, surface.mean, surface.std, length_scale, pose.roll, pose.pitch)
 
     @property
-    def azimuth(self) -> FloatArray:
-        """Middle of each segment, (M,) [rad], from -pi on."""
-        n_segments = len(self.height)
-        middle = (np.arange(n_segments) + 0.5) / n_segments
-        return np.asarray(2.0 * np.pi * middle - np.pi, dtype=np.float64)
-
-    @property
     def is_level(self) -> bool:
         """Whether z of the scan's frame is up."""
         return self.roll == 0.0 and self.pitch == 0.0
@@ -81,7 +74,9 @@ class GroundModel:
 
         NaN where there is no model.
         """
-        azimuth = self.azimuth[:, None]
+        n_segments = len(self.height)
+        middle = (np.arange(n_segments)[:, None] + 0.5) / n_segments
+        azimuth = 2.0 * np.pi * middle - np.pi
         along = (self.knots * np.cos(azimuth), self.knots * np.sin(azimuth), self.height)
         level = np.where(np.isfinite(self.height)[..., None], np.stack(along, axis=-1), np.nan)
         return level if self.is_level else np.asarray(level @ rotation(self.roll, self.pitch))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -40,17 +39,9 @@ NO_GROUND = 'next to nothing of the scan is ground: is sensor.height right, and 
 _Value = TypeVar('_Value')
 
 
-class cached_property(functools.cached_property[_Value]):  # noqa: N801 - a decorator
-    """``functools.cached_property``, without the lock that it has before Python 3.12.
-
-    That is one for all objects of the class: a process forked while a thread computes the property
-    of any of them would wait for it for ever. Two threads that ask one object at once may both
-    compute the value, which is the same.
-    """
-
-    def __init__(self, compute: Callable[[Any], _Value]) -> None:
-        super().__init__(usual_errors()(compute))
-        self.lock = contextlib.nullcontext()
+def cached_property(compute: Callable[[Any], _Value]) -> functools.cached_property[_Value]:
+    """``functools.cached_property``, computed whatever ``np.seterr`` the caller has."""
+    return functools.cached_property(usual_errors()(compute))
 
 
 @dataclass(frozen=True)

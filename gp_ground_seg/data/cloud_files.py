@@ -97,10 +97,8 @@ def _shapes(arrays: Columns) -> str:
 def _encode_npy(cloud: Cloud) -> bytes:
     """File of a structured array."""
     file = io.BytesIO()
-    is_ascii = ''.join(cloud.fields.dtype.names or ()).isascii()
-    # Without numpy's warning that names beyond ASCII need numpy 1.17.
-    version = None if is_ascii else (3, 0)
-    np.lib.format.write_array(file, cloud.fields, version, allow_pickle=False)
+    # Of numpy 1.17: names may be beyond ASCII.
+    np.lib.format.write_array(file, cloud.fields, (3, 0), allow_pickle=False)
     return file.getvalue()
 
 
@@ -128,9 +126,6 @@ FORMATS = (LABELS, *(suffix[1:] for suffix in WRITABLE))
 # Unlabelled, road and other-object.
 SEMANTIC_KITTI_CODE = {Label.UNKNOWN: 0, Label.GROUND: 40, Label.OBSTACLE: 99}
 _VALUES = ('height', 'ground_z', 'ground_std', 'p_ground')
-TEXT_SUFFIXES = ('.xyz', '.txt', '.csv')
-"""Files of text, whose columns nobody knows but their author."""
-FROM_TEXT = 'a text of points: load it by numpy.loadtxt or pandas.read_csv, save x y z as .npy'
 
 
 def read_file(path: Path, columns: int = KITTI_COLUMNS) -> Cloud:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+import logging
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import LOGGER, PointCloudError
+from gp_ground_seg.core.errors import PointCloudError, log_once
 
 Fields = npt.NDArray[np.void]
 Columns = dict[str, npt.NDArray[Any]]
@@ -23,10 +23,7 @@ COLUMNS = ('x', 'y', 'z', 'intensity')
 MAX_NUMBERS = 1000
 """Most numbers of a point: the header of a file without points can name any number."""
 _MAX_HEADER_BYTES = 1 << 16
-_COORDINATES = frozenset('xyzXYZ')
 _LONG = {'i8', 'u8'}
-_NO_NUMBER = re.compile(rb'[-+]?(nan\(\w+\)|1\.#(QNAN|SNAN|IND)\w*)', re.IGNORECASE)
-"""NaN as programs on Windows write it."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +58,6 @@ class Cloud:
 def coordinate_names(names: Collection[str]) -> list[str]:
     """Names of x, y and z, which some programs write as capitals."""
     return [name if name in names else name.upper() for name in 'xyz']
-
-
-@functools.cache
-def note(text: str) -> None:
-    """Log a text once, however many files it is about."""
-    LOGGER.info(text)
 
 
 def cloud_of(fields: Fields, header: Any = None) -> Cloud:
@@ -155,13 +146,11 @@ def in_types(
         values = values.astype(f'<{code}')
         word = '_'.join(name.split())
         word = 'field' if word in ('', '_') else word  # _ is the padding of a PCD
-        if flat and values.ndim > 1:
-            table = values.reshape(len(values), math.prod(values.shape[1:]))
-            names += [f'{word}_{k}' for k in range(table.shape[1])]
-            columns += list(table.T)
-        else:
-            names.append(word)
-            columns.append(values)
+        parts = [values]
+        if is_split := flat and values.ndim > 1:
+            parts = list(values.reshape(len(values), math.prod(values.shape[1:])).T)
+        names += [f'{word}_{k}' if is_split else word for k in range(len(parts))]
+        columns += parts
     return gather(dict(zip(distinct(names), columns, strict=True)))
 
 
@@ -194,8 +183,8 @@ def read_table(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
 def read_lines(text: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
     """Read points of a text, one a line; PointCloudError if there are fewer than it should have.
 
-    Further words of a line are left out. An integer field that has other numbers becomes float64.
-    A field beside x, y and z that has no numbers is left out.
+    Further words of a line are left out. What is no number is NaN, and an integer field that has
+    other numbers becomes float64.
     """
     lines = [line for line in text.splitlines() if line.strip()][:n_points]
     if len(lines) < n_points:
@@ -206,25 +195,18 @@ def read_lines(text: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
         return np.empty(0, dtype)
     with suppress(ValueError, TypeError):
         return np.loadtxt(lines, dtype, comments=None, ndmin=1, usecols=range(wanted))
-    lines = [_NO_NUMBER.sub(b'nan', line) for line in lines]
     if (n_words := min(len(line.split()) for line in lines)) < wanted:
         raise PointCloudError(
             f'a line of {n_words} words, its header says {wanted}, separated by spaces'
         )
+    table = np.genfromtxt(lines, comments='\n', usecols=range(wanted), encoding='latin-1')
     columns: Columns = {}
-    stop = 0
     for name in dtype.names or ():
         own, shape = dtype[name].base, dtype[name].shape
-        start, stop = stop, stop + math.prod(shape)
-        for kind in (own, np.dtype('f8')):
-            with suppress(ValueError, TypeError):
-                values = np.loadtxt(lines, kind, None, usecols=range(start, stop), ndmin=2)
-                columns[name] = values.reshape(-1, *shape)
-                break
-        if name not in columns:
-            if name in _COORDINATES:
-                raise PointCloudError(f'field {name}: has what is no number')
-            note(f'field {name}: has what is no number; left out')
-        elif columns[name].dtype != own:
-            note(f'field {name}: has numbers that are no {own}; read as float64')
+        values, table = np.split(table.reshape(n_points, -1), [math.prod(shape)], axis=1)
+        columns[name] = values.astype(own).reshape(-1, *shape)
+        if own.kind != 'f' and (columns[name].reshape(values.shape) != values).any():
+            said = f'field {name}: has numbers that are no {own}; read as float64'
+            log_once(logging.INFO, said)
+            columns[name] = values.reshape(-1, *shape)
     return gather(columns)

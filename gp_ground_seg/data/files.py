@@ -14,7 +14,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +25,6 @@ from gp_ground_seg.core.errors import (
     in_one_line,
     reason_of,
 )
-from gp_ground_seg.data.bag_files import is_bag_folder
 
 MAX_SCAN_BYTES = 1 << 30  # of a file: 67 million points, a hundred times a dense scan
 PARTIAL_MARK = '.partial-'  # part of the names of hidden folders with unfinished output
@@ -143,11 +142,6 @@ def staged_file(
         yield product
 
 
-def staged_bag_folder(target: str | Path, *, force: bool) -> AbstractContextManager[Path]:
-    """Return the path of a folder to create, as `staged_file`; `force` replaces a rosbag2 only."""
-    return staged_file(target, force=force, is_kind=is_bag_folder)
-
-
 def check_writable(target: str | Path, *, force: bool) -> None:
     """Raise what `staged_file` would, for a file that is written later."""
     with staged_file(target, force=force):
@@ -195,7 +189,7 @@ def _staged(
 def _check(target: str | Path, force: bool, is_kind: Callable[[Path], bool], path: Path) -> None:
     """Raise DataError if what is there may not be replaced."""
     if path.exists() and not is_kind(path):
-        kind = 'rosbag2 folder' if is_kind is is_bag_folder else 'file'
+        kind = 'file' if is_kind is Path.is_file else 'rosbag2 folder'
         raise DataError(f'{target}: is not a {kind}, not replaced; remove it yourself')
     if path.exists() and not force:
         raise DataError(f'{target}: exists already; --force replaces it')

@@ -12,23 +12,14 @@ from pathlib import Path
 
 from gp_ground_seg.core.errors import LOGGER, DataError, shown
 from gp_ground_seg.core.pipeline.points import take_points
-from gp_ground_seg.data.bag_files import BAG_SUFFIXES, METADATA_FILE
-from gp_ground_seg.data.bags import BagReader, decode_cloud
-from gp_ground_seg.data.cloud_files import (
-    FROM_TEXT,
-    KITTI_COLUMNS,
-    NUSCENES_SUFFIX,
-    SUFFIXES,
-    TEXT_SUFFIXES,
-    read_file,
-)
+from gp_ground_seg.data.bags import BAG_SUFFIXES, METADATA_FILE, BagReader, decode_cloud
+from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, NUSCENES_SUFFIX, SUFFIXES, read_file
 from gp_ground_seg.data.clouds import Cloud
 from gp_ground_seg.data.files import naming
 from gp_ground_seg.data.point_cloud2 import read_fields, read_xyz
 
-# Where the scans are in a sequence of SemanticKITTI or a root of nuScenes, and those sequences.
+# Where the scans are in a sequence of SemanticKITTI or a root of nuScenes.
 _SCAN_FOLDERS = ('.', 'velodyne', 'samples/LIDAR_TOP')
-_DRIVES = 'sequences/*/velodyne'
 _OUTPUT = re.compile(r'_ground(_ground|_obstacles|_surface)?$')
 """What `segment` adds to the name of a scan whose output goes beside it."""
 
@@ -142,33 +133,23 @@ def _find_files(source: Path) -> Sequence[Path]:
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
     if not source.is_dir():
-        if source.suffix.lower() in TEXT_SUFFIXES:
-            raise DataError(f'{source}: {FROM_TEXT}')
         if source.suffix.lower() not in SUFFIXES:
             raise DataError(
                 f'{source}: not a scan or bag; accepted are {accepted}, .bag, .mcap and .db3 '
-                'files, folders of scans and rosbag2 folders'
+                'files, folders of scans and rosbag2 folders; of a text, save x, y, z as .npy'
             )
         return [source]
     for name in _SCAN_FOLDERS:
         folder = source / name
         if files := sorted(filter(_is_scan, folder.glob('*'))):
             return _without_output(files)
-    drives = sorted(str(path.parent) for path in source.glob(_DRIVES))
-    hint = ''
-    if drives:
-        names = ', '.join(Path(drive).name for drive in drives)
-        hint = f'; give one of its sequences ({names}), as in {drives[0]}'
-    elif texts := [path for path in source.glob('*') if path.suffix.lower() in TEXT_SUFFIXES]:
-        hint = f'; {min(texts).name} may be {FROM_TEXT}'
-    raise DataError(f'{source}: no {accepted} file in it, and not a rosbag2 folder{hint}')
+    raise DataError(f'{source}: no {accepted} file in it, and not a rosbag2 folder')
 
 
 def _without_output(files: Sequence[Path]) -> Sequence[Path]:
     """Leave out files that are named as the output of another one."""
     stems = {_stem(file) for file in files}
-    sources = {stem: _OUTPUT.sub('', stem) for stem in stems}
-    outputs = {stem for stem, source in sources.items() if source != stem and source in stems}
+    outputs = {stem for stem in stems if _OUTPUT.sub('', stem) in stems - {stem}}
     kept = [file for file in files if _stem(file) not in outputs]
     if n_left_out := len(files) - len(kept):
         LOGGER.info('output of earlier runs left out: %d of %d files', n_left_out, len(files))

@@ -8,18 +8,18 @@ Source: http://paulbourke.net/dataformats/ply/.
 
 from __future__ import annotations
 
+import logging
 from typing import Any, Literal
 
 import numpy as np
 
-from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.errors import PointCloudError, log_once
 from gp_ground_seg.data.clouds import (
     Cloud,
     Fields,
     check_size,
     distinct,
     in_types,
-    note,
     read_lines,
     read_table,
     split_header,
@@ -93,7 +93,7 @@ def _types_of(properties: list[list[str]], order: _ByteOrder) -> tuple[np.dtype[
             names.append(line[-1])
             codes.append(f'{"<" if order == "little" else ">"}{found[0]}')
     if lists:
-        note(f'PLY: lists of the vertices are left out: {", ".join(lists)}')
+        log_once(logging.INFO, f'PLY: lists of the vertices are left out: {", ".join(lists)}')
     dtype = np.dtype(list(zip(distinct(names), codes, strict=True)))
     return dtype, list(lists.values())
 

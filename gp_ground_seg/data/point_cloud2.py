@@ -220,15 +220,8 @@ def select_points(
 
     It has the same header and fields, and one row. ``is_dense`` says whether the kept points are
     all finite; they are looked at unless the caller knows that they `are_finite`. `make_data`
-    makes what the message holds so many bytes in. Raises PointCloudError for another mask, and as
-    `read_xyz` does.
+    makes what the message holds so many bytes in. Raises PointCloudError as `read_xyz` does.
     """
-    size = cloud.height * cloud.width
-    if mask.shape != (size,) or mask.dtype != np.bool_:
-        raise PointCloudError(
-            f'mask of shape {mask.shape} and type {mask.dtype}: '
-            f'must be bool of shape ({size},), one per point'
-        )
     index = np.flatnonzero(mask)
     kept = copy(cloud)
     kept.height, kept.width = 1, len(index)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy.typing as npt
 from gp_ground_seg.core.errors import LOGGER, DataError
 from gp_ground_seg.core.frame import BoolArray
 from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, four_columns, read_scan
-from gp_ground_seg.data.files import read_bytes
+from gp_ground_seg.data.files import naming, read_bytes
 
 UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70
 """Classes that are neither ground nor obstacle."""
@@ -112,24 +111,18 @@ def labelled_frames(
     Sequences of SemanticKITTI's test set have none; a note says which are left out. Raises
     DataError if a sequence is not there, a named one or a single frame has no labels, or all.
     """
-    known = list_sequences(root)
-    chosen = list(dict.fromkeys(known if sequences is None else sequences))
-    unknown = [name for name in chosen if name not in known]
-    if unknown or not chosen:
-        problem = f'no sequence {", ".join(unknown)}' if chosen else 'no sequence asked for'
-        raise DataError(f'{root}: {problem}; sequences here: {", ".join(known)}')
     frames, left_out = [], []
-    for name in chosen:
+    for name in list_sequences(root) if sequences is None else dict.fromkeys(sequences):
         listed = list_frames(root, name, columns)
         bare = [frame.index for frame in listed if frame.labels_path is None]
         if sequences is None and len(bare) == len(listed):
             left_out.append(name)
-            continue
-        if bare:
+        elif bare:
             raise DataError(f'{root}: frames of sequence {name} have no labels, as {bare[0]}')
-        frames += listed
+        else:
+            frames += listed
     if not frames:
-        raise DataError(f'{root}: no sequence has labels, of {", ".join(known)}')
+        raise DataError(f'{root}: no sequence has labels, of {", ".join(list_sequences(root))}')
     if left_out:
         LOGGER.info('sequences without labels left out: %s', ', '.join(left_out))
     return frames
@@ -139,21 +132,13 @@ def _read_times(path: Path, frames: Sequence[Path]) -> list[float]:
     """Time of each frame: line k of times.txt belongs to the file numbered k."""
     if not path.exists():
         return [FRAME_PERIOD * k for k in range(len(frames))]
-    try:
-        lines = [float(word) for word in read_bytes(path, _MAX_TIMES_BYTES).split()]
-    except ValueError as error:
-        raise DataError(f'{path}: {error}') from error
-    times: list[float] = []
-    for frame in frames:
-        if not frame.stem.isdecimal():
-            raise DataError(f'{frame}: the name must be a number, that of its line in {path.name}')
-        if int(frame.stem) >= len(lines):
-            raise DataError(f'{path}: {len(lines)} times, too few for frame {frame.stem}')
-        time = lines[int(frame.stem)]
-        if not math.isfinite(time) or (times and time <= times[-1]):
-            raise DataError(f'{path}: {time:g} s of frame {frame.stem}: times must increase')
-        times.append(time)
-    return times
+    data = read_bytes(path, _MAX_TIMES_BYTES)
+    with naming(path, 'cannot be read as the times of these frames'):
+        lines = np.array(data.split(), np.float64)
+        times = lines[[int(frame.stem) for frame in frames]]
+    if not (np.isfinite(times).all() and (np.diff(times) > 0.0).all()):
+        raise DataError(f'{path}: times must be numbers that increase')
+    return [float(time) for time in times]
 
 
 def read_points(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[np.float32]:

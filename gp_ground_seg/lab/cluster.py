@@ -12,18 +12,25 @@ import multiprocessing
 import os
 import platform
 import signal
-import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import resource_tracker
 from typing import Any
 
 from tqdm import tqdm
 
-import gp_ground_seg
-from gp_ground_seg.core.errors import LOGGER, DataError, in_one_line, messages_passed_to, require
+from gp_ground_seg import __version__
+from gp_ground_seg.core.errors import (
+    LOGGER,
+    DataError,
+    in_one_line,
+    log_once,
+    messages_passed_to,
+    require,
+)
 
 BLOCK_SIZE = 64
 """Items of a block, where there are enough for all workers: they share what a task costs."""
@@ -34,29 +41,29 @@ PACKAGES = 'distributed cryptography'
 
 _NO_BAR = partial(tqdm, disable=True)
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
-"""Wraps items to show how far the work is, as tqdm does."""
+"""Wraps items, once, to show how far the work is, as tqdm does."""
 Function = Callable[[Sequence[Any], Progress], Any]
 """Computes a block of items; a module's function or a `partial` of one, to be sent to workers."""
 _Notes = list[tuple[int, str]]  # what the library logs: severity and text
 
 
+@dataclass(frozen=True)
 class Runner:
     """Computes blocks of items; by default one after the other, in this process.
 
-    Parameters
+    Attributes
     ----------
     bar : callable
-        Makes the progress bar of a number of items, ``bar(total=n)``.
+        Makes a progress bar, as tqdm does.
     client : distributed.Client, optional
         Of the cluster that computes the blocks.
     n_workers : int
         How many there are; 0 in this process.
     """
 
-    def __init__(
-        self, bar: Callable[..., tqdm[Any]] = _NO_BAR, client: Any = None, n_workers: int = 0
-    ) -> None:
-        self._bar, self._client, self.n_workers = bar, client, n_workers
+    bar: Callable[..., tqdm[Any]] = _NO_BAR
+    client: Any = None
+    n_workers: int = 0
 
     def run(
         self,
@@ -71,52 +78,41 @@ class Runner:
         of each block. A block whose worker dies is computed again. Raises what `function` raises,
         and DataError if every worker that computes a block dies, or the scheduler is lost.
         """
-        with self._bar(total=size_of(items)) as bar:
-            if self._client is None:
-                return [function(items, partial(_count, bar))]
-            blocks = cut(items, group, self.n_workers)
-            found: list[Any] = [None] * len(blocks)
-            for k, result in self._compute(function, blocks):
-                found[k] = result
-                bar.update(size_of(blocks[k]))
+        if self.client is None:
+            return [function(items, partial(self.bar, total=size_of(items)))]
+        from distributed import as_completed
+
+        blocks = cut(items, group, self.n_workers)
+        compute = partial(_compute_block, __version__, function)
+        futures = self.client.map(compute, blocks, pure=False)
+        numbers, found = {future: k for k, future in enumerate(futures)}, [None] * len(blocks)
+        with self.bar(total=size_of(items)) as bar:
+            for future in as_completed(futures, loop=self.client.loop):
+                block = blocks[k := numbers[future]]
+                found[k], notes = _result_of(future, block)
+                for note in notes:
+                    log_once(*note)
+                bar.update(size_of(block))
         return found
 
-    def _compute(
-        self, function: Function, blocks: Sequence[Sequence[Any]]
-    ) -> Iterator[tuple[int, Any]]:
-        """Yield the number and the result of each block when it is finished."""
-        from distributed import KilledWorker, as_completed
 
-        compute, said = partial(_compute_block, _versions(), function), set[str]()
-        numbers = {
-            self._client.submit(compute, block, pure=False): k for k, block in enumerate(blocks)
-        }
-        for future in as_completed([*numbers], loop=self._client.loop):
-            k = numbers.pop(future)  # or the cluster would keep the result
-            try:
-                result, notes = future.result()
-            except CancelledError as error:
-                raise DataError('the scheduler is lost') from error
-            except KilledWorker as error:
-                raise DataError(
-                    f'{blocks[k][0]} to {blocks[k][-1]}: each worker that computed this block '
-                    'died, as where memory is short: fewer workers have more of it each'
-                ) from error
-            for level, line in notes:
-                if line not in said:
-                    said.add(line)
-                    LOGGER.log(level, '%s', line)
-            yield k, result
+def _result_of(future: Any, block: Sequence[Any]) -> Any:
+    """Return what `_compute_block` did; DataError if workers or the scheduler died."""
+    from distributed import KilledWorker
+
+    try:
+        return future.result()
+    except CancelledError as error:
+        raise DataError('the scheduler is lost') from error
+    except KilledWorker as error:
+        raise DataError(
+            f'{block[0]} to {block[-1]}: each worker that computed this block died, as where '
+            'memory is short: fewer workers have more of it each'
+        ) from error
 
 
 HERE = Runner()
 """In this process, without a bar."""
-
-
-def _count(bar: tqdm[Any], items: Iterable[Any]) -> Iterator[Any]:
-    for item in items:
-        yield item
-        bar.update()
 
 
 def cut(
@@ -135,7 +131,7 @@ def cut(
 
 def package_versions(*packages: str) -> dict[str, str | None]:
     """Versions of what labels depend on, and of further `packages`; None: not installed."""
-    versions: dict[str, str | None] = {'gp_ground_seg': gp_ground_seg.__version__}
+    versions: dict[str, str | None] = {'gp_ground_seg': __version__}
     for package in ('numpy', 'scipy', 'numba', *packages):
         try:
             versions[package] = importlib.metadata.version(package)
@@ -144,24 +140,13 @@ def package_versions(*packages: str) -> dict[str, str | None]:
     return versions
 
 
-def _versions() -> dict[str, str | None]:
-    """Versions of what labels depend on."""
-    return {**package_versions(), 'Python': platform.python_version()}
-
-
-def _compute_block(
-    expected: dict[str, str | None], function: Function, block: Sequence[Any]
-) -> tuple[Any, _Notes]:
+def _compute_block(version: str, function: Function, block: Sequence[Any]) -> tuple[Any, _Notes]:
     """Compute a block in a worker; return the result and what the library logged meanwhile."""
-    here, notes = _versions(), _Notes()
-    other = [
-        f'{name} {v}, not {expected[name]}' for name, v in here.items() if v != expected[name]
-    ]
-    if here['gp_ground_seg'] != expected['gp_ground_seg']:
-        raise DataError(f'a worker on {platform.node()} has {"; ".join(other)}')
-    if other:
-        line = f'a worker on {platform.node()} has {"; ".join(other)}: last digits may differ'
-        notes.append((logging.WARNING, line))
+    if version != __version__:
+        raise DataError(
+            f'a worker on {platform.node()} has gp_ground_seg {__version__}, not {version}'
+        )
+    notes = _Notes()
     with messages_passed_to(lambda *message: notes.append(message)):
         return function(block, iter), notes
 
@@ -182,11 +167,8 @@ def open_runner(
                 LOGGER.warning('the scheduler has no worker yet, waiting for one')
             yield Runner(bar, client, n_workers)
     elif workers is not None:
-        most = 4 * (os.cpu_count() or 1)
-        if workers > most:
-            raise DataError(
-                f'--workers {workers}: must be 1 to {most} here, four for each processor'
-            )
+        if workers > (most := 4 * (os.cpu_count() or 1)):
+            raise DataError(f'--workers {workers}: more than {most}, four for each processor')
         with _start_workers(workers) as client:
             yield Runner(bar, client, workers)
     else:
@@ -257,14 +239,9 @@ def _ctrl_c_kept() -> Iterator[None]:
 
 def _connect(address: str) -> Any:
     """Connect to a scheduler, with the keys of Dask's configuration."""
-    if not address.startswith(('tcp://', 'tls://')):
-        raise DataError(f'--scheduler {address}: must be tcp://HOST:PORT, or tls://')
     distributed = _quiet_distributed()
     try:
-        with warnings.catch_warnings():
-            # Versions are compared by `_compute_block`, which says in one line what differs.
-            warnings.simplefilter('ignore', distributed.versions.VersionMismatchWarning)
-            return distributed.Client(address, set_as_default=False, timeout=CONNECT_TIMEOUT)
+        return distributed.Client(address, set_as_default=False, timeout=CONNECT_TIMEOUT)
     except (OSError, ValueError, TypeError, MemoryError) as error:  # memory: no Dask speaks there
         text = f'--scheduler {address}: does not answer ({in_one_line(error)})'
         raise DataError(text) from error

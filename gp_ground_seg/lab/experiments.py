@@ -1,46 +1,52 @@
-"""Variants of the method on the same scans: models, steps, pseudo-inputs, and their speed.
+"""The experiments of docs/: functions from scans, parameters and a runner to a report.
 
-Each experiment is a function from scans, parameters and a runner to tables; what it compares it
-sets itself, over the parameters given.
+The docstring of each is its help. What an experiment compares it sets itself, over the parameters
+given; scans are labelled frames, or simulated, with exact labels and heights.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 from gp_ground_seg.core.backend import make_backend
-from gp_ground_seg.core.errors import in_thousands
-from gp_ground_seg.core.parameters.config import Config, find_preset, find_spec
+from gp_ground_seg.core.errors import DataError, in_thousands
+from gp_ground_seg.core.frame import OUTSIDE, FloatArray, Label
+from gp_ground_seg.core.parameters.config import Config, find_preset
 from gp_ground_seg.data.semantic_kitti import Frame, read_points
 from gp_ground_seg.lab.cluster import HERE, Runner
-from gp_ground_seg.lab.scenes import load_scan
 from gp_ground_seg.lab.scoring.evaluate import (
+    ALL,
     PATCHWORKPP,
     KnownScan,
     Method,
     OurMethod,
     Scores,
+    load_kitti,
     score_methods,
+    sums,
 )
+from gp_ground_seg.lab.scoring.metrics import ratio
+from gp_ground_seg.lab.scoring.objects import CLASSES, LOW_CLASSES, LOW_HEIGHTS, Objects
 from gp_ground_seg.lab.scoring.peers import InterpolationMethod, PatchworkppMethod
-from gp_ground_seg.lab.scoring.report import (
-    SIGNED,
-    Form,
-    Report,
-    Table,
-    changed_parameters,
-    frame_of,
-)
+from gp_ground_seg.lab.scoring.report import COUNT, SIGNED, Form, Report, Table, frame_of
 from gp_ground_seg.lab.scoring.tables import (
     MEASURES,
+    beside,
     interval_note,
     interval_text,
     make_report,
     measured,
+    peer_note,
     time_tables,
 )
+from gp_ground_seg.lab.simulation import LOW, PLACES, SCENES, SENSORS, STEEP, Kind, simulate_scan
+from gp_ground_seg.lab.simulation.objects import object_heights
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -48,13 +54,75 @@ if TYPE_CHECKING:
 Changes = Mapping[str, Any]
 """Values of parameters, by dotted name."""
 
-_ALL: Changes = {'learning.fixed': 'none'}
+# Simulated scans.
+
+OBJECT_KINDS = {'vehicle': Kind.BOX, 'person': Kind.PERSON, 'cyclist': Kind.CYCLIST}
+"""Kinds of objects that rays hit, by `CLASSES`; crates are boxes too, but no objects."""
+LOWEST_OBJECT = 0.7
+"""Objects of less than this height are of the nearest of `LOW_CLASSES`, of any kind [m]."""
+
+
+class SimulatedFrame(NamedTuple):
+    """A scan to simulate: `seed` is that of the scene and of the noise, `x` a place [m]."""
+
+    sensor: str
+    scene: str
+    seed: int
+    x: float = 0.0
+
+    @property
+    def sequence(self) -> str:
+        """Scans of one sensor in one kind of scene belong together."""
+        return f'{self.sensor} {self.scene}'
+
+
+def simulated_frames(
+    sensors: Sequence[str], scenes: Sequence[str], n_seeds: int, places: Sequence[float]
+) -> list[SimulatedFrame]:
+    """Sensors by scenes by seeds by places; scenes without a free lane from the origin only."""
+    cases = itertools.product(sensors, scenes, range(n_seeds), places)
+    return [SimulatedFrame(*case) for case in cases if not case[3] or case[1] not in PLACES]
+
+
+def load_scan(item: Frame | SimulatedFrame) -> KnownScan:
+    """Read a labelled frame, or simulate: what the ray hit of the terrain is ground."""
+    if isinstance(item, Frame):
+        return load_kitti(item)
+    scene, rng = SCENES[item.scene](item.seed), np.random.default_rng(item.seed)
+    made = simulate_scan(scene, SENSORS[item.sensor], rng, x=item.x)
+    truth = np.where(made.is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
+    heights = object_heights(scene.terrain, scene.solids)[made.object_id]
+    class_of = _class_of(made.kind, made.object_id, heights)
+    return KnownScan(
+        item.sequence, f'{item.seed}/{item.x:g}', made.points, truth,
+        ground_z=made.ground_z, is_ground=made.is_ground,
+        objects=Objects(class_of, made.object_id, made.ground_z),
+        std='ground_std', cluster=f'{item.scene} {item.seed}',
+    )  # fmt: skip
+
+
+def _class_of(
+    kind: npt.NDArray[np.uint8], object_id: npt.NDArray[np.int32], height: FloatArray
+) -> npt.NDArray[np.integer]:
+    """Index into `CLASSES` of what each ray hit, and how high that is, (N,); -1: no object."""
+    class_of = np.full(len(kind), -1)
+    for number, name in enumerate(OBJECT_KINDS):
+        class_of[(kind == OBJECT_KINDS[name]) & (object_id > 0)] = number
+    low = height < LOWEST_OBJECT
+    nearest = np.abs(height[low, None] - LOW_HEIGHTS).argmin(axis=1)
+    class_of[low] = len(CLASSES) - len(LOW_CLASSES) + nearest
+    return class_of
+
+
+# Variants of the method on the same scans.
+
 MODELS: dict[str, Changes] = {
     f'{model}, {how}': {'length_scale.model': name, 'learning.mode': mode}
     for model, name in (('constant', 'constant'), ('Z', 'line_gradient'), ('Z-L', 'latent'))
     for how, mode in (('not learned', 'fixed'), ('learned', 'every_frame'))
 }
-MODELS['Z-L, all learned'] = {**MODELS['Z-L, learned'], **_ALL}
+ALL_LEARNED: Changes = {'length_scale.model': 'latent', 'learning.fixed': 'none'}
+MODELS['Z-L, all learned'] = ALL_LEARNED
 """Length-scale models, each with theta given and with sigma_f and sigma_n learned, as by default;
 the last one learns all length-scales too, as the paper does."""
 PAIRS = [
@@ -66,8 +134,6 @@ PAIRS = [
     ('Z-L, all learned', 'Z-L, learned'),
 ]
 """Models of which the differences are shown."""
-SCENE, PLACES = 'road_then_rubble', (0.0, 6.0, 12.0)
-"""Simulated road, and where the sensor stands on it [m]; the rubble begins at 14 to 20 m."""
 
 STEPS = {
     'vertical faces': ('faces.',),
@@ -77,7 +143,7 @@ STEPS = {
     'gate and lines of the growth': ('growth.', 'lines.'),
     'all else: bins, learning, sensor pose': ('',),
 }
-"""Steps from the preset ``paper`` to the defaults: beginnings of the names that change."""
+"""Steps from the preset ``paper`` to the parameters: beginnings of the names that change."""
 
 CANDIDATES_PER_PSEUDO_INPUT = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
 """Candidates of a line for each pseudo-input; with the last, most lines have one."""
@@ -89,10 +155,7 @@ N_PASSES = 3
 
 
 def score_variants(
-    items: Sequence[Any],
-    variants: Mapping[str, Config],
-    peers: Sequence[Method] = (),
-    runner: Runner = HERE,
+    items: Sequence[Any], variants: Mapping[str, Config], peers: Sequence[Method], runner: Runner
 ) -> tuple[Scores, DataFrame]:
     """Run variants, then `peers`, once on every scan, alternately, each scan without a past.
 
@@ -130,8 +193,8 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
 
     A constant length-scale, the gradients of the lines (Z), and the latent process (Z-L), and
     beside them a surface that is interpolated between lowest points; then each pair with its
-    interval. On labelled frames, or on a simulated smooth road that ends in rubble, or the rough
-    ground of ``--scenes``, by exact labels and heights.
+    interval. On labelled frames, or without ROOT on a simulated smooth road that ends in rubble,
+    or the rough ground of ``--scenes``, by exact labels and heights.
     """
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     scores, models = score_variants(items, variants, [InterpolationMethod(config)], runner)
@@ -153,33 +216,28 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
         f'{interval_note(scores)}'
     )
     models = models[['method', 'iou', 'rmse', 'median_absolute']]
-    tables = {
-        'models': Table(_counted(scores), models),
-        'pairs': Table(of_pairs, rows, forms),
-    }
+    tables = {'models': Table(_counted(scores), models), 'pairs': Table(of_pairs, rows, forms)}
     return make_report(tables, scores, config)
 
 
-def paper_steps() -> dict[str, Config]:
-    """Return configurations from the paper to the defaults, by what is new in each."""
+def paper_steps(config: Config) -> dict[str, Config]:
+    """Return parameters from the paper's to those given, by what is new in each."""
     steps = {'the paper (preset paper)': find_preset('paper').config}
     for title, beginnings in STEPS.items():
         *_, last = steps.values()
-        names = [name for name in changed_parameters(last) if name.startswith(beginnings)]
-        steps[f'+ {title}'] = last.replace(**{name: find_spec(name).default for name in names})
+        new = {spec.name: value for spec, _, value in last.differences(config)}
+        changes = {name: value for name, value in new.items() if name.startswith(beginnings)}
+        steps[f'+ {title}'] = last.replace(**changes)
     return steps
 
 
-def compare_steps(
-    items: Sequence[Any], config: Config, runner: Runner = HERE, *, with_peer: bool = True
-) -> Report:
+def compare_steps(items: Sequence[Any], config: Config, runner: Runner = HERE) -> Report:
     """Go from the paper's method to the defaults, one step after the other.
 
     Beside Patchwork++, and a surface that is interpolated between lowest points, with our labels.
     """
-    steps = paper_steps()
-    peers: list[Method] = [InterpolationMethod(config)]
-    peers += [PatchworkppMethod()] if with_peer else []
+    steps = paper_steps(config)
+    peers: list[Method] = [InterpolationMethod(config), PatchworkppMethod()]
     scores, table = score_variants(items, steps, peers, runner)
     names, last = scores.methods, [*steps][-1]
     above = [names[0], *names[: len(steps) - 1], *[last] * len(peers)]
@@ -197,13 +255,11 @@ def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner =
 
     All length-scales are learned.
     """
+    name = 'latent.candidates_per_pseudo_input'
     variants = {
-        f'{n:g}': config.replace(
-            **_ALL, **{'length_scale.model': 'latent', 'latent.candidates_per_pseudo_input': n}
-        )
-        for n in CANDIDATES_PER_PSEUDO_INPUT
+        f'{n:g}': config.replace(**ALL_LEARNED, **{name: n}) for n in CANDIDATES_PER_PSEUDO_INPUT
     }
-    scores, table = score_variants(items, variants, runner=runner)
+    scores, table = score_variants(items, variants, [], runner)
     n_inputs = scores.scans['n_pseudo_inputs'] / scores.scans['n_segments']
     scans = scores.scans.assign(n_inputs=n_inputs).groupby('method', sort=False, as_index=False)
     pairs = [(name, scores.methods[0]) for name in scores.methods]
@@ -221,9 +277,7 @@ def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner =
     return make_report({'pseudo_inputs': Table(title, table, forms)}, scores, config)
 
 
-def measure_speed(
-    items: Sequence[Frame], config: Config, runner: Runner = HERE, *, with_peer: bool = True
-) -> Report:
+def measure_speed(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Report:
     """Time each frame by stage, beside Patchwork++ on the same frame.
 
     With theta learned in every frame and with theta fixed, by the backend of the parameters and
@@ -231,24 +285,226 @@ def measure_speed(
     frame by frame, so it holds although the speed of the machine drifts. Run nothing else
     meanwhile.
     """
-    numpy = {'runtime.backend': 'numpy'}
     variants: dict[str, Changes] = {title: {'learning.mode': m} for m, title in MODES.items()}
     if make_backend(config.runtime).name != 'numpy':
+        numpy = {'runtime.backend': 'numpy'}
         variants |= {f'{title}, numpy': {**own, **numpy} for title, own in variants.items()}
     methods: list[Method] = [OurMethod(config.replace(**v), name) for name, v in variants.items()]
-    if with_peer:
-        methods.insert(len(MODES), PatchworkppMethod.of_sensor(config.sensor))
+    methods.insert(len(MODES), PatchworkppMethod.of_sensor(config.sensor))
     scores = score_methods([*items] * N_PASSES, methods, _points_of, runner=runner)
     points = scores.scans['points']
     title = (
         f'Time per frame: {len(items)} frames, {N_PASSES} passes, reading left out; '
         f'{in_thousands(points.median())} points (median), at most {in_thousands(points.max())}'
     )
-    tables = time_tables(scores, PATCHWORKPP if with_peer else '', title)
-    return make_report(tables, scores, config)
+    return make_report(time_tables(scores, PATCHWORKPP, title), scores, config)
 
 
 def _points_of(frame: Frame) -> KnownScan:
     """Read the points alone: what is not scored leaves the caches as they are."""
     points = read_points(frame.points_path, frame.columns)
     return KnownScan(frame.sequence, frame.index, points)
+
+
+# Simulated scenes: ours beside Patchwork++, and objects lost.
+
+ROUGH = ('rough', 'road_then_rubble', 'ramp', 'ditch', 'crest', 'blind_slope', *STEEP)
+"""Scenes of rough and of steep ground."""
+COUNTED = {'vehicles': ('vehicle',), 'persons': ('person', 'cyclist')}
+"""Columns of objects, and their `CLASSES`."""
+
+
+def score_scenes(
+    frames: Sequence[SimulatedFrame], config: Config, runner: Runner = HERE
+) -> Report:
+    """Score simulated scans by exact labels and heights, and count objects and low things lost.
+
+    An object is lost if more than half of its returns from 0.3 m above the ground are called
+    ground; returns on low things count from 0.1 m on. Patchwork++ beside it has its published
+    parameters and the true height and place of the sensor. All sensors have one set of
+    parameters. Low things, and rough and steep ground, have tables of their own.
+    """
+    parts = []
+    for sensor, group in itertools.groupby(frames, attrgetter('sensor')):
+        model = SENSORS[sensor]
+        peer = PatchworkppMethod(model.height, model.origin or (0.0, 0.0, 0.0))
+        methods: list[Method] = [OurMethod(config), peer]
+        parts.append(score_methods([*group], methods, load_scan, each_alone=True, runner=runner))
+    scores = Scores.joined(parts)
+    tables = {'scenes': _scene_table(scores)}
+    for name, make, scenes in (('low', _low_table, LOW), ('rough', _rough_table, ROUGH)):
+        if own := [pair for pair in scores.sequences if pair.split()[1] in scenes]:
+            tables[name] = make(scores.of(own))
+    return make_report(tables, scores, config)
+
+
+def _placed(table: DataFrame) -> DataFrame:
+    """Return rows by sequence with columns of sensor and scene in place of it."""
+    names = table.index.str.split(expand=True).rename(['sensor', 'scene'])
+    return table.set_axis(names).reset_index()
+
+
+def _scene_table(scores: Scores) -> Table:
+    """One row for each sensor and scene: ground, height, objects lost."""
+    found = measured(scores.scans, 'sequence')[['iou', 'rmse']]
+    forms = dict[str, Form]()
+    for kind, classes in COUNTED.items():
+        own = sums(scores.objects[scores.objects['class'].isin(classes)], 'sequence')
+        own = own.reindex(found.index, fill_value=0)
+        found = found.assign(**{kind: own['n_objects'], f'lost_{kind}': own['n_lost']})
+        forms |= {kind: Form(kind, *COUNT), f'lost_{kind}': Form('lost', *COUNT)}
+    table = beside(found, scores).drop(columns='difference')
+    title = (
+        'IoU of the ground against exact labels [%]; RMSE of the surface [cm]; vehicles, persons '
+        'and cyclists, and those lost'
+    )
+    title += peer_note(scores, ', which gets the true height and place of the sensor')
+    return Table(title, _placed(table), forms)
+
+
+def _low_table(scores: Scores) -> Table:
+    """Lay out the share of low things lost, by height; ours, then the peer."""
+    low = scores.objects[scores.objects['class'].isin(LOW_CLASSES)]
+    by_class = sums(low, 'sequence', 'class')
+    shares = ratio(by_class['n_lost'], by_class['n_objects']).unstack('class')
+    things = sums(low, 'sequence')['n_objects'].to_frame('things')
+    found = things.join(shares.reindex(columns=[*LOW_CLASSES]))
+    title = 'Low things by height, in plain view 3 to 20 m away, and the share that is lost [%]'
+    forms = {name: Form(name.removeprefix('low, '), '.0f', 100.0) for name in LOW_CLASSES}
+    forms['things'] = Form('things', *COUNT)
+    return Table(title + peer_note(scores), _placed(beside(found, scores)), forms)
+
+
+def _rough_table(scores: Scores) -> Table:
+    """One row for each scene, over its sensors, and one for all."""
+    found = measured(scores.scans, 'sequence').reset_index()
+    found['scene'] = found['sequence'].str.split().str[1]
+    how = {'n_scans': 'sum', 'n_objects': 'sum', 'iou': 'mean', 'rmse': 'mean', 'n_lost': 'sum'}
+    found = found.groupby(['method', 'scene'], sort=False).agg(how)
+    table = beside(found, scores)
+    means = table.mean()
+    means.update(table.filter(like='n_').sum())
+    table.loc[ALL] = means
+    title = (
+        'Rough and steep ground, means over the sensors: IoU against exact labels [%]; RMSE of '
+        'the surface [cm]; vehicles, persons and crates, and those lost'
+    )
+    title += peer_note(scores, ', which gets the true height')
+    return Table(title, table.reset_index())
+
+
+# The paper's Table I.
+
+COMPARED = {'Z-L': 'latent', 'Z': 'line_gradient'}
+"""The paper's method and the one it is compared with, as values of ``length_scale.model``."""
+CHOICES = {('10', '000000'): (157, 158), ('03', '000006'): (147, 148)}
+"""Segments by sequence and frame: an adjacent pair that climbs a verge and a hill, 3 m over 30 m,
+and one on uneven ground."""
+N_REPEATS = 9
+VARIANCES = ('sigma_f^2', 'sigma_n^2', 'sigma_f_bar^2', 'sigma_l_bar^2', 'sigma_n_bar^2')
+"""Squares of the first entries of theta: in m^2; those of f_bar and n_bar without unit."""
+SMSE, HELD_OUT, TIMES = (
+    [f'{what}{name}{unit}' for name in COMPARED]
+    for what, unit in (('in sample ', ''), ('held out ', ''), ('t ', ' [s]'))
+)
+PRINTED = {
+    'a': (36, 23, 0.3663, 0.8607, 1.415e6, 2.250e6, 1.187e6,
+          2.4258e-27, 1.4978e-23, 0.5432, 0.2335),
+    'b': (52, 30, 0.3117, 0.7207, 4.729e6, 1.347e6, 2.058e6,
+          1.2466e-28, 1.1231e-23, 1.0045, 0.4356),
+    'c': (68, 16, 0.4896, 1.1544, 1.381e6, 3.881e6, 4.501e6,
+          2.7561e-26, 1.4102e-21, 0.3283, 0.1963),
+    'd': (81, 14, 0.1103, 1.6487, 4.588e6, 3.521e6, 4.402e6,
+          4.2903e-19, 8.6733e-22, 0.2732, 0.3412),
+}  # fmt: skip
+"""n_PG, n_L, `VARIANCES`, `SMSE`, `TIMES` in the paper, of segments a to d of its Figure 1; it
+names no frames."""
+
+
+def table1(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Report:
+    """Measure the paper's Table I on segments of labelled frames, beside its printed values.
+
+    P. Mehrabi and H. D. Taghirad, "A Novel Gaussian Process Based Ground Segmentation Algorithm
+    with Local-Smoothness Estimation", arXiv 2112.05847. With the parameters given (ours), and
+    with the preset ``paper``. Each method runs on each frame once without counting, then nine
+    times, alternately.
+    """
+    frames = {(frame.sequence, frame.index): frame for frame in items}
+    for sequence, index in CHOICES.keys() - frames.keys():
+        raise DataError(f'no frame {index} in sequence {sequence}')
+    rows: list[dict[str, Any]] = []
+    for by, own in {'ours': config, 'preset': find_preset('paper').config}.items():
+        methods = [
+            OurMethod(own.replace(**{**ALL_LEARNED, 'length_scale.model': model}), name)
+            for name, model in COMPARED.items()
+        ]
+        for choice, segments in CHOICES.items():
+            rows += ({'by': by, **row} for row in _rows(frames[choice], segments, methods, runner))
+    columns = ['n_PG', 'n_L', *VARIANCES, *SMSE, *TIMES]
+    printed = (
+        {'segment': name, 'by': 'paper', **dict(zip(columns, values, strict=True))}
+        for name, values in PRINTED.items()
+    )
+    every = frame_of([*rows, *printed])
+    variances = (
+        'Variances learned over the frame by Z-L [m^2; of f_bar and n_bar without unit]; preset: '
+        'the preset paper; paper: as printed, of its segments a to d'
+    )
+    errors = (
+        'SMSE in sample (at the inliers) and held out (n points of labelled ground); seconds per '
+        f'frame: median of {N_REPEATS} runs on the whole frame, reading left out'
+    )
+    forms = {name: Form(name, '#.4g') for name in (*VARIANCES, *SMSE, *HELD_OUT)}
+    forms |= {name: Form(name, '.4f') for name in TIMES}
+    forms |= {name: Form(name.split()[-1], *COUNT) for name in (*columns[:2], 'held out n')}
+    shown = every[['segment', 'by', *SMSE, 'held out n', *HELD_OUT, *TIMES]]
+    tables = {
+        'variances': Table(variances, every[['segment', 'by', *columns[:7]]], forms),
+        'errors': Table(errors, shown, forms),
+    }
+    return Report(tables, rows, methods[0].last.fit.backend, config)
+
+
+def _rows(
+    frame: Frame, segments: Sequence[int], methods: Sequence[OurMethod], runner: Runner
+) -> list[dict[str, Any]]:
+    """Rows of a frame, by title of the column."""
+    scan = load_kitti(frame)
+    z = scan.points[:, 2].astype(np.float64)
+    scores = score_methods([scan] * N_REPEATS, methods, lambda scan: scan, runner=runner)
+    seconds = scores.scans.groupby('method')['seconds'].median()
+    # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
+    common = methods[0].last
+    candidates = common.candidates
+    # A candidate is the point at the same place.
+    x, y, _ = common.pose.level(scan.points[:, :3]).T
+    modelled = scan.is_ground & (common.grid.bin != OUTSIDE)
+    rows = []
+    for segment in segments:
+        part = slice(*candidates.offsets[segment : segment + 2])
+        held_out = modelled & (common.grid.segment == segment)
+        held_out &= ~np.isin(x + 1j * y, candidates.x[part] + 1j * candidates.y[part])
+        row: dict[str, Any] = {
+            'segment': f'{frame.sequence}/{frame.index}:{segment}',
+            'n_PG': int(part.stop - part.start),
+            'n_L': int(np.diff(common.pseudo.offsets)[segment]),
+            **dict(zip(VARIANCES, np.exp(2.0 * common.theta).tolist(), strict=False)),
+            'held out n': int(held_out.sum()),
+        }
+        for k, method in enumerate(methods):
+            result, surface = method.last, method.last.surface
+            r, at = result.candidates.r[part], surface.inlier[part]
+            estimate = np.interp(r[at], surface.knots, surface.mean[segment])
+            row[SMSE[k]] = _smse(result.candidates.z[part][at], estimate)
+            # Of the process itself, as in the paper; not the corrected surface.
+            row[HELD_OUT[k]] = _smse(z[held_out], z[held_out] - result.labelled.height[held_out])
+            row[TIMES[k]] = seconds[method.name]
+        rows.append(row)
+    return rows
+
+
+def _smse(truth: FloatArray, estimate: FloatArray) -> float:
+    """Standardised mean squared error of heights, (n,) [m], where there is a model."""
+    known = np.isfinite(estimate)
+    truth, estimate = truth[known], estimate[known]
+    return float(np.mean((estimate - truth) ** 2) / np.var(truth))

@@ -22,12 +22,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.points import take_points
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.files import staged_file, writing
-from gp_ground_seg.lab.scoring.metrics import (
-    Labels,
-    check_lengths,
-    count_labels,
-    label_ratios,
-)
+from gp_ground_seg.lab.scoring.metrics import Labels, count_labels, label_ratios
 
 COLOURS = {
     'ground': '#B9BFC6',
@@ -86,7 +81,6 @@ def plot_scan_view(
     or SVG points are pixels.
     """
     xyz = take_points(points).astype(np.float64)
-    check_lengths(len(xyz), label=label, truth=truth)
     said, layers = label_layers(label, truth)
     figure, foot = new_figure(WIDTH, HEIGHT + FOOT), FOOT / (HEIGHT + FOOT)
     axes = figure.add_axes((0.0, foot, 1.0, 1.0 - foot))
@@ -162,15 +156,9 @@ def label_layers(label: Labels, truth: Labels | None = None) -> tuple[str, Layer
 CANDIDATE_COLOUR = '#56636E'
 LINE_COLOUR, SURFACE_COLOUR, PSEUDO_INPUT_COLOUR = GREEN, '#111111', VIOLET
 
-# Metres kept free below and above the ground, and beyond the last candidate; and the distance
-# from the ground up to which a candidate is always in the picture.
-BELOW, ABOVE, BEYOND, NEAR_GROUND = 0.25, 0.9, 2.0, 1.0
+# Metres kept free below and above the ground, and beyond the last candidate.
+BELOW, ABOVE, BEYOND = 0.4, 0.9, 2.0
 N_OF_LINE = 16  # places at which a line is drawn over the relief
-
-
-def segment_at(azimuth: float, n_segments: int) -> int:
-    """Return the segment towards an azimuth [rad], counter-clockwise from x."""
-    return math.floor((azimuth / math.tau + 0.5) * n_segments) % n_segments
 
 
 def plot_segment(
@@ -181,15 +169,14 @@ def plot_segment(
     path: str | Path,
     truth: Labels | None = None,
     title: str = '',
-) -> None:
+) -> str:
     """Draw segments from the side, side by side; below each the length-scale and pseudo-inputs.
 
     `result` is the segmentation of `points`, (N, >=3) [m], under `config`. `truth` (N,) are true
     labels, UNKNOWN where a point does not count. The axes end a little beyond the last candidate.
-    The file `path` is replaced.
+    The file `path` is replaced. Return numbers of what is in them.
     """
     z = result.pose.level(take_points(points).astype(np.float64))[:, 2].astype(np.float64)
-    check_lengths(len(z), result=result.label, truth=truth)
     views = [SegmentView(result, segment, z) for segment in segments]
     figure = new_figure(5.0 + 6.5 * len(views), 7.6)
     figure.set_layout_engine('constrained')
@@ -203,7 +190,7 @@ def plot_segment(
         view.draw_length_scale(below, config)
         title = ''
     reach = max(view.reach() for view in views)
-    lows, highs = zip(*(view.heights_shown(reach) for view in views), strict=True)
+    lows, highs = zip(*(view.heights_shown() for view in views), strict=True)
     panels[0, 0].set_xlim(0.0, reach)
     panels[0, 0].set_ylim(min(lows), max(highs))
     for axes in panels.flat:
@@ -213,6 +200,7 @@ def plot_segment(
     for axes in panels[:, -1]:
         axes.legend(loc='upper left', bbox_to_anchor=(1.01, 1.01), frameon=False)
     save(figure, path)
+    return '; '.join(view.counts for view in views)
 
 
 class SegmentView:
@@ -245,6 +233,15 @@ class SegmentView:
         first, last = (width * (self._segment + k) - 180.0 for k in (0, 1))
         model = '' if np.isfinite(self._mean).any() else ': no ground model'
         return f'segment {self._segment}, azimuth {first:g}° to {last:g}°{model}'
+
+    @property
+    def counts(self) -> str:
+        """Numbers of candidates, inliers and pseudo-inputs."""
+        n_pseudo = np.diff(self._result.pseudo.offsets)[self._segment]
+        return (
+            f'segment {self._segment}: {len(self._r)} candidates, {self._inlier.sum()} inliers, '
+            f'{n_pseudo} pseudo-inputs'
+        )
 
     def _relief(self, r: FloatArray) -> FloatArray:
         """Height of the relief at ranges (K,) in the middle of the segment, (K,) [m]."""
@@ -279,14 +276,12 @@ class SegmentView:
             axes.plot(self._r[chosen], self._z[chosen], 'o', label=label, **look)
         axes.set_ylabel('height z, sensor frame [m]')
 
-    def heights_shown(self, reach: float) -> tuple[float, float]:
-        """Limits around the candidates near the ground, as far as it rests on inliers [m]."""
-        if not (self._inlier & (self._r <= reach)).any():
-            low, high = np.quantile(self.z, (0.0, 0.5)) if len(self.z) else (-2.0, 0.0)
-            return float(low) - BELOW, float(high) + ABOVE
-        height = np.abs(self._z - np.interp(self._r, self._knots, self._mean))
-        near = self._z[(height <= NEAR_GROUND) & (self._r <= reach)]
-        return float(near.min()) - BELOW, float(near.max()) + ABOVE
+    def heights_shown(self) -> tuple[float, float]:
+        """Limits around the inliers, or if none the lower half of the points [m]."""
+        z = self._z[self._inlier]
+        if not len(z):
+            z = np.quantile(self.z, (0.0, 0.5)) if len(self.z) else np.array([-2.0, 0.0])
+        return float(z.min()) - BELOW, float(z.max()) + ABOVE
 
     def _draw_lines(self, axes: Any) -> None:
         """Draw each line over its extent, and the critical points where the next one begins."""

@@ -110,7 +110,7 @@ class CloudSubscription:
     """Why no clouds were wanted at the last review; empty if they were."""
     _subscription: Any = None
     _reliability = ReliabilityPolicy.UNKNOWN
-    _fault_of_types = _fault_of_size = ''
+    _fault_of_types = _fault_of_size = _fault_of_clock = ''
 
     def __init__(
         self,
@@ -136,7 +136,7 @@ class CloudSubscription:
         self._review_soon = node.create_guard_condition(self.review)
         # The event can come before the publisher is listed, and there is no event for the end
         # of the last best-effort publisher: they are looked at every second too.
-        node.create_timer(1.0, self._review_soon.trigger, clock=STEADY_CLOCK)
+        node.create_timer(1.0, self._every_second, clock=STEADY_CLOCK)
 
     @property
     def qos_words(self) -> str:
@@ -156,7 +156,7 @@ class CloudSubscription:
         is_refused = ReliabilityPolicy.BEST_EFFORT in self._offered.values()
         is_pinned = self._is_pinned and self._reliability == ReliabilityPolicy.RELIABLE
         other = NOTHING_ARRIVES if is_pinned and is_refused else self._fault_of_size
-        return '; '.join(filter(None, (self._fault_of_types, other)))
+        return '; '.join(filter(None, (self._fault_of_types, other, self._fault_of_clock)))
 
     def _receive(self, cloud: PointCloud2, info: dict[str, Any]) -> None:
         if not self._offered:
@@ -208,6 +208,14 @@ class CloudSubscription:
         if is_changed:
             self._gaps.reset()
         return is_changed
+
+    def _every_second(self) -> None:
+        clock = self._node.get_clock()
+        has_time = not clock.ros_time_is_active or clock.now().nanoseconds
+        self._fault_of_clock = '' if has_time else NO_TIME
+        if not has_time:
+            self._node.get_logger().warning(NO_TIME, once=True)
+        self._review_soon.trigger()
 
     def review(self) -> None:
         """Subscribe as the publishers offer, or not at all, as clouds are wanted now; log it."""

@@ -55,6 +55,7 @@ class BackendLoader:
 
     error = ''
     seconds = 0.0
+    is_started = False
     is_ready = False
     """Whether `take_backend` has a result that was not taken yet."""
     _backend: Backend | None = None
@@ -67,17 +68,13 @@ class BackendLoader:
         self._lock = threading.Lock()
 
     @property
-    def is_started(self) -> bool:
-        """Whether `start` has been called."""
-        return self._thread is not None
-
-    @property
     def is_busy(self) -> bool:
         """Whether the thread runs."""
         return self._thread is not None and self._thread.is_alive()
 
     def start(self, config: Config) -> None:
         """Begin to make the backend for `config`."""
+        self.is_started = True
         self._thread = threading.Thread(target=self._run, args=(config,), daemon=True)
         self._thread.start()
 

@@ -35,8 +35,8 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.ros.arguments import initialize, start_errors, unused_files, with_file
-from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts, kept_height
-from gp_ground_seg.ros.input import NO_TIME, STEADY_CLOCK, THROTTLED, CloudSubscription
+from gp_ground_seg.ros.diagnostics import Diagnostics, kept_height
+from gp_ground_seg.ros.input import STEADY_CLOCK, THROTTLED, CloudSubscription
 from gp_ground_seg.ros.loader import CHANGED, FOLLOWS, STAYS, BackendLoader
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
@@ -102,7 +102,7 @@ class GroundSegmentationNode(ConfiguredNode):
                 self, 'points', self._on_cloud, self._why_idle, self._on_time_jump
             )
         self._follow_frames(self.config)
-        self._diagnostics = Diagnostics(self, self._state, self.config.diagnostics)
+        self._diagnostics = Diagnostics(self, self._input, self.config.diagnostics)
         self.warn_of_unused_parameters()
         self._load_backend(self.config)
         self._input.review()
@@ -128,14 +128,14 @@ class GroundSegmentationNode(ConfiguredNode):
                 text = f'on {self._input.topic}, {kept_height(result.pose)}'
                 self.get_logger().warning(text, **THROTTLED)
             segmented = time.monotonic()
-            topics = self._outputs.publish(SegmentedCloud(cloud, result, self.config, points))
+            self._outputs.publish(SegmentedCloud(cloud, result, self.config, points))
         except Exception as error:
             # The next cloud may be good.
             self._refuse(cloud, error)
             return
         publishing = time.monotonic() - segmented
         stages = {'queue': start - arrival, **result.timings, 'publish': publishing}
-        self._diagnostics.published(result, arrival, stages, topics)
+        self._diagnostics.published(result, arrival, stages)
 
     def _why_idle(self) -> str:
         """Why no clouds are wanted now; empty if they are."""
@@ -204,11 +204,6 @@ class GroundSegmentationNode(ConfiguredNode):
             self._frames = FrameListener(self, config, self._on_cloud)
         self._input.callback = self._frames.hold if self._frames else self._on_cloud
 
-    @property
-    def is_compiling(self) -> bool:
-        """Whether the compiled backend is being made, in a thread of this process."""
-        return self._loader.is_busy
-
     def destroy_node(self) -> None:
         """Free what the node holds."""
         self._loader.stop()
@@ -222,20 +217,6 @@ class GroundSegmentationNode(ConfiguredNode):
         if self._frames is not None:
             self._frames.time_jumped(seconds)
         self._diagnostics.input.time_jumped()
-
-    def _state(self) -> tuple[InputFacts, dict[str, int]]:
-        clock = self.get_clock()
-        source, now = self._input, 1e-9 * clock.now().nanoseconds
-        is_simulated = clock.ros_time_is_active
-        faults = [source.fault] if source.fault else []
-        if is_simulated and not now:
-            self.get_logger().warning(NO_TIME, once=True)
-            faults.append(NO_TIME)
-        facts = InputFacts(
-            source.topic, source.qos_words, source.n_publishers, now, is_simulated,
-            '; '.join(faults), source.idle,
-        )  # fmt: skip
-        return facts, self._outputs.n_subscribers()
 
 
 class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[misc]
@@ -390,7 +371,7 @@ def main(args: Sequence[str] | None = None, *, is_managed: bool = False) -> int:
             if node is not None:
                 node.destroy_node()
             rclpy.try_shutdown()
-    if node is not None and node.is_compiling:
+    if node is not None and node._loader.is_busy:
         # The end of the interpreter would wait for LLVM, for ten seconds and more.
         os._exit(0)
     return 0

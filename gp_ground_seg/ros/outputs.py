@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from copy import copy
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 
 from gp_ground_seg.core.frame import NOT_FINITE, BoolArray
-from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.data.costmap import (
     DIRECTIONS,
     SegmentedCloud,
@@ -26,14 +26,18 @@ from gp_ground_seg.data.point_cloud2 import (
     append_columns,
     message_bytes,
     message_data,
+    read_columns,
     read_xyz,
     select_points,
 )
-from gp_ground_seg.ros.ground_model import ground_model_cloud
 from gp_ground_seg.ros.input import seconds_of
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
+MODEL_FIELDS = ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')
+"""Fields of ``~/ground_model``, all float32 [m, rad]. The last three locate a place in the grid:
+the horizontal range of the knot in the level frame, and the angles, equal in all points, that turn
+the cloud's frame into the level one."""
 OUTPUT_DEPTH = 20  # messages kept: Fast DDS may send a lost fragment again after 0.7 s only
 LONGEST_PERIOD = 1.0
 """Time between two clouds [s] from which on some are missing: ``scan_time`` is 0 then."""
@@ -48,30 +52,20 @@ class Output(NamedTuple):
     is_optional: bool  # built only while it has a subscriber
 
 
-def labelled_names(taken: Iterable[str]) -> dict[str, str]:
-    """Return a free name for each of `LABELLED_FIELDS`: with ``gp_`` where it is `taken`."""
-    used, names = set(taken), {}
-    for field in LABELLED_FIELDS:
-        name = field
-        while name in used:
-            name = f'gp_{name}'
-        used.add(name)
-        names[field] = name
-    return names
-
-
-def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud2:
-    """Return `cloud` with `LABELLED_FIELDS` added to every point.
+def labelled_cloud(segmented: SegmentedCloud) -> PointCloud2:
+    """Return the cloud with `LABELLED_FIELDS` added to every point, with ``gp_`` if in use.
 
     Header, order, shape and every byte of every point are the input's; padding of the rows is
     left out. ``is_dense`` tells whether the coordinates and all added values are finite.
     """
-    columns = {}
-    for field, name in labelled_names(field.name for field in cloud.fields).items():
-        columns[name] = getattr(segmentation, field)
-        if field != 'label':
-            with np.errstate(over='ignore'):
-                columns[name] = columns[name].astype(np.float32, copy=False)
+    cloud, columns = segmented.cloud, {}
+    for field in LABELLED_FIELDS:
+        name = field
+        while name in columns or any(name == other.name for other in cloud.fields):
+            name = f'gp_{name}'
+        values = getattr(segmented.segmentation, field)
+        with np.errstate(over='ignore'):
+            columns[name] = values if field == 'label' else values.astype(np.float32, copy=False)
     placed, step, data = append_columns(cloud, columns)
     message = copy(cloud)
     message.fields = [
@@ -83,6 +77,48 @@ def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud
     known = read_xyz(cloud), *columns.values()
     message.is_dense = all(bool(np.isfinite(values).all()) for values in known)
     return message
+
+
+def ground_model_cloud(segmented: SegmentedCloud) -> PointCloud2:
+    """Return the surface of a segmented cloud as an organised cloud with its header.
+
+    Row m is segment m, counter-clockwise from -x of the level frame; column k is the k-th
+    range. The coordinates and std are NaN where there is no model, length_scale in
+    segments without a ground candidate.
+    """
+    model = GroundModel.of(segmented.segmentation)
+    n_segments, n_knots = model.height.shape
+    points = np.empty((n_segments, n_knots, len(MODEL_FIELDS)), dtype='<f4')
+    with np.errstate(over='ignore'):
+        points[..., :3] = model.knot_points()
+        points[..., 3] = model.std
+        points[..., 4] = model.length_scale
+        points[..., 5] = model.knots
+        points[..., 6:] = model.roll, model.pitch
+    message = PointCloud2(
+        header=segmented.cloud.header,
+        height=n_segments,
+        width=n_knots,
+        fields=[
+            PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1)
+            for k, name in enumerate(MODEL_FIELDS)
+        ],
+        is_bigendian=False,
+        point_step=4 * len(MODEL_FIELDS),
+        row_step=4 * len(MODEL_FIELDS) * n_knots,
+        is_dense=bool(np.isfinite(points).all()),
+    )
+    message.data = message_data(points)
+    return message
+
+
+def read_ground_model(cloud: PointCloud2) -> GroundModel:
+    """Return the model in a cloud of ``~/ground_model``; `GroundModel.at` gives heights.
+
+    `cloud` is a message of rclpy, or one with the same attributes, such as that of rosbags. Raises
+    a PointCloudError if a field is missing, or if the points are not such a grid.
+    """
+    return GroundModel.from_columns(read_columns(cloud, MODEL_FIELDS))
 
 
 def scan(segmented: SegmentedCloud) -> LaserScan:
@@ -124,10 +160,8 @@ def _selected(segmented: SegmentedCloud, chosen: BoolArray) -> PointCloud2:
 OUTPUTS = (
     Output('ground', PointCloud2, lambda s: _selected(s, s.is_ground), False),
     Output('obstacles', PointCloud2, lambda s: _selected(s, s.is_obstacle), False),
-    Output('~/labeled', PointCloud2, lambda s: labelled_cloud(s.cloud, s.segmentation), True),
-    Output(
-        '~/ground_model', PointCloud2, lambda s: ground_model_cloud(s.cloud, s.segmentation), True
-    ),
+    Output('~/labeled', PointCloud2, labelled_cloud, True),
+    Output('~/ground_model', PointCloud2, ground_model_cloud, True),
     Output('~/scan', LaserScan, scan, True),
     Output('~/occupancy', OccupancyGrid, occupancy_grid, True),
 )
@@ -149,8 +183,8 @@ class OutputPublishers:
         """Return the number of subscribers of each topic."""
         return {p.topic_name: p.get_subscription_count() for _, p in self._publishers}
 
-    def publish(self, segmented: SegmentedCloud) -> list[str]:
-        """Publish all outputs of a cloud, or none if one cannot be built; return their topics."""
+    def publish(self, segmented: SegmentedCloud) -> None:
+        """Publish all outputs of a cloud, or none if one cannot be built."""
         seconds = seconds_of(segmented.cloud.header.stamp)
         period, self._stamp = seconds - self._stamp, seconds
         messages = [
@@ -162,4 +196,3 @@ class OutputPublishers:
             if isinstance(message, LaserScan):
                 message.scan_time = period if 0.0 < period < LONGEST_PERIOD else 0.0
             publisher.publish(message)
-        return [publisher.topic_name for publisher, _ in messages]

@@ -42,15 +42,12 @@ def find_module(name: str) -> Any:
 
 def check_tf2(config: Config) -> None:
     """Raise a MissingDependencyError if `config` asks for TF and tf2_ros is not installed."""
-    if not is_tf_used(config) or find_module('tf2_ros') is not None:
-        return
-    asked, instead = 'frame.level = tf', 'frame.level = sensor with sensor.roll and sensor.pitch'
-    if config.frame.sensor != NO_FRAME:
-        asked = f'frame.sensor = {config.frame.sensor}'
-        instead = 'frame.sensor = none with sensor.origin_x, origin_y and origin_z'
-    raise MissingDependencyError(
-        f'{asked}: needs tf2_ros, which cannot be imported: {INSTALL_TF2}, or use {instead}'
-    )
+    if is_tf_used(config) and find_module('tf2_ros') is None:
+        frame = config.frame
+        asked = 'level = tf' if frame.level == 'tf' else f'sensor = {frame.sensor}'
+        raise MissingDependencyError(
+            f'frame.{asked}: needs tf2_ros, which cannot be imported: {INSTALL_TF2}'
+        )
 
 
 def rotation_of(rotation: Quaternion) -> FloatArray:
@@ -184,23 +181,21 @@ class FrameListener:
         if self._imu is not None and not self._imu.reaches(header):
             return False
         try:
-            self._look_up(header, self._exact)
+            self.look_up(header, is_exact=True)
         except self._not_yet:
             return False
         except (PointCloudError, ValueError):
             return True  # the cloud is refused with the reason
         return True
 
-    def look_up(self, header: Header) -> CloudFrames:
+    def look_up(self, header: Header, is_exact: bool = False) -> CloudFrames:
         """Return tilt and place of the sensor at the stamp of a cloud, as the parameters ask.
 
-        If TF does not reach the stamp, its newest transform is used. Raises a PointCloudError if
-        a transform or an orientation is missing.
+        If TF does not reach the stamp, its newest transform is used, unless it `is_exact`. Raises
+        a PointCloudError if a transform or an orientation is missing.
         """
-        return self._look_up(header, self._newest)
-
-    def _look_up(self, header: Header, transform: Callable[..., Any]) -> CloudFrames:
         tilt, origin, base = None, None, None
+        transform = self._exact if is_exact else self._newest
         frame_id, frame = header.frame_id, self.config.frame
         if frame.level == 'tf':
             way = f'from its frame {frame_id!r} to frame.base = {frame.base!r}'

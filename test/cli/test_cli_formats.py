@@ -89,8 +89,7 @@ FOLDERS = {
     ),
     'SemanticKITTI': (['velodyne/000007.bin', 'labels/000007.label'], ['000007']),
     'nuScenes': (['samples/LIDAR_TOP/a__LIDAR_TOP__1.pcd.bin'], ['a__LIDAR_TOP__1']),
-    'sequences': (['sequences/00/velodyne/0.bin'], r'give one of its sequences \(00\), as in'),
-    'texts': (['a.xyz'], r'no \.bin, .* file in it, .*; a\.xyz may be a text of points'),
+    'sequences': (['sequences/00/velodyne/0.bin'], r'no \.bin, .* file in it, and not a rosbag2'),
 }
 
 
@@ -114,12 +113,7 @@ def test_what_a_folder_has(tmp_path, caplog, kind):
 def test_clouds_and_pictures_of_a_bag(tmp_path, capsys):
     bag = tmp_path / 'drive.mcap'
     write_ros2_bag(bag)
-    inputs = list_inputs(bag)
-    assert (len(inputs), inputs.topic, inputs[2].name) == (3, '/points', '000002')
-    np.testing.assert_array_equal(inputs[2].read().xyz, scan(2)[:, :3])
-    assert [one.title for one in inputs] == [f'drive.mcap[{k}]' for k in range(3)]
-    with pytest.raises(IndexError):
-        inputs[3]
+    assert [one.title for one in list_inputs(bag)] == [f'drive.mcap[{k}]' for k in range(3)]
     assert run('segment', bag, '--format', 'npz', '--quiet') == 0
     for k in range(3):
         with np.load(tmp_path / 'drive_ground' / f'{k:06d}.npz') as found:

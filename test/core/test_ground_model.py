@@ -123,13 +123,8 @@ def test_any_place_has_a_height_or_none(x, y):
         inside = np.hypot(x, y) < 4.0
     assert (height == -1.0) == inside
     assert np.isnan(std) != inside
-
-
-def test_places_broadcast():
-    ones = np.ones((4, 2))
-    model = GroundModel(np.array([0.0, 1.0]), ones * [0.0, 1.0], ones, ones)
-    height, _ = model.at(np.linspace(-1, 1, 5)[:, None], np.zeros(3))
-    np.testing.assert_allclose(height, np.tile([[np.nan], [0.5], [0], [0.5], [np.nan]], 3))
+    heights, _ = flat(1.0, 2.0, 4.0).at(np.full((3, 1), x), np.full(2, y))
+    np.testing.assert_array_equal(heights, np.full((3, 2), height))
 
 
 def test_what_is_no_polar_grid_is_refused():

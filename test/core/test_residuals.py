@@ -52,18 +52,6 @@ def test_the_correction_is_the_reference(seed, n_returns):
     assert (found.return_std >= found.std)[np.isfinite(mean)].all()
 
 
-def test_nothing_is_computed_before_it_is_asked_for(monkeypatch):
-    def asked(*_):
-        raise AssertionError('asked for')
-
-    monkeypatch.setattr('gp_ground_seg.core.result.correct_surface', asked)
-    result = GroundSegmenter().segment(hilly_scan())
-    assert np.isfinite(result.p_ground).all()
-    assert result.fit.n_inliers > 0
-    with pytest.raises(AssertionError, match='asked for'):
-        _ = result.height
-
-
 @pytest.mark.parametrize('tilt', [None, (0.05, -0.1)])
 def test_height_and_ground_z_are_of_one_surface(tilt):
     points = hilly_scan()

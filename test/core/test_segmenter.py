@@ -6,7 +6,6 @@ import pickle
 import re
 import subprocess
 import sys
-import threading
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from unittest.mock import patch
@@ -14,8 +13,6 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from conftest import fewer, hilly_scan
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from reference import Reference
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
@@ -129,34 +126,24 @@ def test_arguments_that_are_refused(points, given, message):
         segmenter_of(**{'input.crop_box': (0.0, 1.0) * 3}).segment(points, **given)
 
 
-@settings(max_examples=fewer(8, 3))
-@given(st.integers(0, 2**32 - 1))
-def test_permuting_points_permutes_the_result(backend, seed):
-    points = hilly_scan(600, seed=seed)
-    points[::50] = np.nan
-    order = np.random.default_rng(seed).permutation(len(points))
+@pytest.mark.parametrize('dtype', ['f4', 'f8'])
+def test_order_and_layout_of_the_points_do_not_matter(backend, scan, dtype):
     segmenter = GroundSegmenter(CONFIG, backend=backend)
-    straight, shuffled = segmenter.segment(points), segmenter.segment(points[order])
-    np.testing.assert_array_equal(shuffled.label, straight.label[order])
-    np.testing.assert_array_equal(shuffled.ground_z, straight.ground_z[order])
-
-
-def test_layouts_of_the_same_points_give_the_same(backend, scan):
-    segmenter = GroundSegmenter(CONFIG, backend=backend)
-    points = scan.astype(np.float32)
-    wide = np.full((len(points), 7), np.nan, dtype=np.float32)
+    scan[::50] = np.nan
+    points = scan.astype(dtype)
+    order = np.random.default_rng(0).permutation(len(points))
+    base, shuffled = segmenter.segment(points), segmenter.segment(points[order])
+    for name in VALUES:
+        np.testing.assert_array_equal(getattr(shuffled, name), getattr(base, name)[order])
+    wide = np.full((len(points), 7), np.nan, dtype)
     wide[:, :3] = points
-    base = segmenter.segment(points)
-    same(base, segmenter.segment(wide))
-    same(base, segmenter.segment(np.asfortranarray(points)))
-    same(base, segmenter.segment(points.astype('>f4')))
-    backwards = segmenter.segment(points[::-1])
-    np.testing.assert_array_equal(backwards.label[::-1], base.label)
+    others = [wide, np.asfortranarray(points), points.astype(f'>{dtype}')]
+    for other in [*others, *[points.tolist()] * (dtype == 'f8')]:
+        same(base, segmenter.segment(other))
     # Ranges are computed in the precision of the points.
     double = segmenter.segment(points.astype(np.float64))
     np.testing.assert_array_equal(base.label, double.label)
     np.testing.assert_allclose(base.ground_z, double.ground_z, rtol=0, atol=5e-6)
-    same(double, segmenter.segment(points.tolist()))
 
 
 def test_callers_whose_numpy_raises_get_the_same(backend, scan):
@@ -183,11 +170,8 @@ def test_results_can_be_copied_and_of_a_segmenter_its_config(scan):
         twin = pickle.loads(pickle.dumps(copy.deepcopy(result)))
         assert result == result and result != twin
         assert [result, twin].index(twin) == len({result, twin, result}) - 1 == 1
-    for attempt in (pickle.dumps, copy.deepcopy):
-        with pytest.raises(TypeError, match='cannot pickle'):
-            attempt(SEGMENTER)
-    other = GroundSegmenter(pickle.loads(pickle.dumps(SEGMENTER.config)))
-    same(other.segment(scan), SEGMENTER.segment(scan))
+    with pytest.raises(TypeError, match='cannot pickle'):
+        pickle.dumps(SEGMENTER)
 
 
 @pytest.mark.parametrize('tilt', [None, (0.05, -0.04)])
@@ -283,13 +267,11 @@ def test_configure_and_use_backend_take_effect_on_the_next_scan(scan):
     segmenter, own = GroundSegmenter(CONFIG), SEGMENTER.backend.name
     segmenter.configure(CONFIG.replace(**{'grid.n_segments': 90}))
     assert len(segmenter.segment(scan).surface.mean) == segmenter.config.grid.n_segments == 90
-    expected = SEGMENTER.segment(scan)
-    for backend, name in (('numpy', 'numpy'), (own, own), ('numpy', 'numpy'), ('auto', own)):
+    for backend, name in (('numpy', 'numpy'), (own, own), ('auto', own)):
         segmenter.configure(CONFIG.replace(**{'runtime.backend': backend}))
         result = segmenter.segment(scan)
         assert result.fit.backend == segmenter.backend.name == name
-        np.testing.assert_array_equal(result.label, expected.label)
-    same(result, expected)
+    same(result, SEGMENTER.segment(scan))
     # A backend that was handed over stays until the parameters of the runtime change.
     segmenter.use_backend(given := NumpyBackend())
     segmenter.configure(CONFIG.replace(**{'label.ground_tolerance': 0.2}))
@@ -309,16 +291,6 @@ def test_callers_take_turns_while_the_segmenter_is_configured():
             segmenter.segment(scans[0][:100])
     for k, result in enumerate(results):
         same(result, expected[k % len(scans)])
-
-
-def test_two_threads_compute_values_of_two_results_at_once():
-    results = [SEGMENTER.segment(hilly_scan(300)) for _ in range(2)]
-    both = threading.Barrier(2)
-    with (
-        patch('gp_ground_seg.core.result.FitReport.of', lambda *_: both.wait(60.0)),
-        ThreadPoolExecutor(2) as pool,
-    ):
-        assert {*pool.map(lambda result: result.fit, results)} == {0, 1}
 
 
 FORK = """

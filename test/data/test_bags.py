@@ -2,16 +2,24 @@
 
 import sqlite3
 import sys
+from functools import partial
 
 import bag_samples as samples
 import pytest
 from rosbags import rosbag2
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import QosReliability
 
 from gp_ground_seg.core.errors import DataError, MissingDependencyError
-from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag_folder, resolve_storage
-from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud, jazzy_types
+from gp_ground_seg.data.bags import (
+    POINT_CLOUD2,
+    BagReader,
+    BagWriter,
+    decode_cloud,
+    encode_cloud,
+    is_bag_folder,
+    jazzy_types,
+    resolve_storage,
+)
 from gp_ground_seg.data.inputs import holds_bag
 
 SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive.db3', None)]
@@ -51,8 +59,7 @@ def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
     with AnyReader([path]) as bag:
         assert bag.message_count == 6
         (connection,) = [c for c in bag.connections if c.topic == '/points']
-        (profile,) = connection.ext.offered_qos_profiles
-        assert profile.reliability is QosReliability.RELIABLE
+        assert connection.ext.offered_qos_profiles == []  # ros2 bag play offers it reliably
         *_, raw = next(bag.messages([connection]))
         assert bag.deserialize(raw, POINT_CLOUD2).header.frame_id == 'velo_link'
 
@@ -68,7 +75,6 @@ def test_packed_bags_are_read(tmp_path, storage, mode):
         topic = writer.add_connection('/points', POINT_CLOUD2, typestore=jazzy_types())
         for k, data in enumerate(raw):
             writer.write(topic, k, data)
-    assert is_bag_folder(tmp_path / 'drive')
     assert read_all(tmp_path / 'drive') == [('/points', k, data) for k, data in enumerate(raw)]
 
 
@@ -76,9 +82,7 @@ def test_clouds_of_ros1(tmp_path):
     """A definition of another topic that cannot be parsed does not matter."""
     path = tmp_path / 'drive.bag'
     samples.write_ros1_bag(path)
-    content = path.read_bytes()
-    assert b'float64 value' in content
-    path.write_bytes(content.replace(b'float64 value', b'float64 **** '))
+    path.write_bytes(path.read_bytes().replace(b'float64 value', b'float64 **** '))
     with BagReader(path) as bag:
         assert bag.storage == 'ros1'
         topic = bag.pick_point_cloud_topic()
@@ -170,19 +174,18 @@ def test_what_is_no_bag_is_never_replaced(tmp_path, name):
     assert (tmp_path / 'file').read_text() == 'years of work'
 
 
-def test_impossible_output_is_refused(tmp_path):
-    for name, storage, message in (
-        ('a.db3', 'mcap', r'ends in \.db3, which is not mcap'),
-        ('a#1', 'sqlite3', 'sqlite3 bag cannot have # in its path'),
-        ('100%.db3', None, 'sqlite3 bag cannot have % in its path'),
-    ):
-        with pytest.raises(DataError, match=message), BagWriter(tmp_path / name, storage=storage):
-            pass
-    assert listing(tmp_path) == []
+def test_impossible_paths_are_refused(tmp_path):
     samples.write_ros2_bag(tmp_path / 'a.db3')
     (tmp_path / 'a.db3').rename(tmp_path / 'a#2?.db3')
-    with pytest.raises(DataError, match=r'sqlite3 bag cannot have # \? in its path'):
-        BagReader(tmp_path / 'a#2?.db3')
+    for make, name, message in (
+        (partial(BagWriter, storage='mcap'), 'a.db3', r'ends in \.db3, which is not mcap'),
+        (partial(BagWriter, storage='sqlite3'), 'a#1', 'sqlite3 bag cannot have # in its path'),
+        (BagWriter, '100%.db3', 'sqlite3 bag cannot have % in its path'),
+        (BagReader, 'a#2?.db3', r'sqlite3 bag cannot have # \? in its path'),
+    ):
+        with pytest.raises(DataError, match=message):
+            make(tmp_path / name)
+    assert listing(tmp_path) == ['a#2?.db3']
 
 
 @pytest.mark.parametrize('call', [BagReader, BagWriter, decode_cloud])

@@ -1,32 +1,32 @@
-"""Variants over frames: the lists, the sums, the search; simulated scenes."""
+"""Experiments over frames: what is compared, the sums, the tables by hand; Table I."""
 
 import itertools
 
 import numpy as np
 import pytest
 from conftest import scene_of, simulated
-from evaluation_samples import scores_of, write_streets
+from evaluation_samples import scores_of, write_frame, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.parameters.config import PRESETS
 from gp_ground_seg.data.semantic_kitti import labelled_frames
-from gp_ground_seg.lab import experiments, scenes
-from gp_ground_seg.lab.experiments import MODELS
-from gp_ground_seg.lab.scoring import evaluate as runner
-from gp_ground_seg.lab.scoring.evaluate import OURS, PATCHWORKPP, make_scores
+from gp_ground_seg.lab import experiments
+from gp_ground_seg.lab.experiments import MODELS, SimulatedFrame, load_scan, simulated_frames
+from gp_ground_seg.lab.scoring.evaluate import (
+    OURS,
+    PATCHWORKPP,
+    load_kitti,
+    make_scores,
+)
 from gp_ground_seg.lab.scoring.metrics import count_labels, height_sums, label_ratios
 from gp_ground_seg.lab.scoring.objects import CLASSES, count_objects
 from gp_ground_seg.lab.scoring.peers import InterpolationMethod, ground_points
 from gp_ground_seg.lab.scoring.report import records
 from gp_ground_seg.lab.scoring.tables import time_tables
-from gp_ground_seg.lab.simulation import Kind
+from gp_ground_seg.lab.simulation import Kind, semantic_kitti_labels
 from gp_ground_seg.lab.simulation.objects import object_heights
 
 FIXED = Config().replace(**{'learning.mode': 'fixed'})
-
-
-def iou_of(label, truth):
-    return label_ratios(count_labels(label, truth))['iou']
 
 
 @pytest.fixture(scope='module')
@@ -34,60 +34,35 @@ def frames(tmp_path_factory):
     return labelled_frames(write_streets(tmp_path_factory.mktemp('kitti'), s00=2, s08=1))
 
 
-def test_models_are_what_their_names_say_and_each_way_to_learn_gives_a_theta(frames):
-    models = {'constant': 'constant', 'Z': 'line_gradient', 'Z-L': 'latent'}
-    configs = {name: Config().replace(**changes) for name, changes in MODELS.items()}
-    for title, config in configs.items():
-        assert config.length_scale.model == models[title.split(',')[0]]
-        assert (config.learning.mode == 'fixed') == ('not learned' in title)
-    # The last one is the paper's method.
-    assert config == Config().replace(**{'learning.fixed': 'none'})
-    points = runner.load_kitti(frames[0]).points
-    theta = {
-        name: tuple(GroundSegmenter(config).segment(points).fit.theta.values())
-        for name, config in configs.items()
-    }
-    assert len(set(theta.values())) == len(MODELS) - 2
-    assert configs['Z-L, learned'] == Config()
-    assert len({values for name, values in theta.items() if 'not learned' in name}) == 1
-
-
 def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     """The worth of the latent process; docs/experiments.md has the whole table."""
     names = ('constant, learned', 'Z, learned', 'Z-L, all learned')
     monkeypatch.setattr(experiments, 'MODELS', {name: MODELS[name] for name in names})
-    places = experiments.PLACES[1:]
-    frames = scenes.simulated_frames(['hdl-64e'], [experiments.SCENE], 1, places)
+    frames = simulated_frames(['hdl-64e'], ['road_then_rubble'], 1, (6.0, 12.0))
     report = experiments.compare_models(frames, Config())
     constant, gradient, latent, _ = (row['rmse'] for row in records(report.tables['models'].frame))
     assert latent < 0.95 * min(constant, gradient)
 
 
 def test_pairs_are_differences_of_models_that_learn_alike():
-    frames = scenes.simulated_frames(['vlp-16'], ['ramp', 'bank'], 1, (0.0,))
+    frames = simulated_frames(['vlp-16'], ['ramp', 'bank'], 1, (0.0,))
     tables = experiments.compare_models(frames, Config()).tables
     of_models = {row['method']: row for row in records(tables['models'].frame)}
-    pairs = records(tables['pairs'].frame)
-    three = ['Z - constant', 'Z-L - constant', 'Z-L - Z']
-    *alike, more, last = [(row['pair'], row['theta']) for row in pairs]
-    assert sorted(alike) == sorted(itertools.product(three, ['learned', 'not learned']))
-    assert (more, last) == (
-        ('Z-L - Z-L', 'all learned - learned'),
-        ('Z-L - interpolation', 'learned'),
-    )
-    for row in pairs[:-2]:
+    *alike, more, last = records(tables['pairs'].frame)
+    assert (more['pair'], more['theta']) == ('Z-L - Z-L', 'all learned - learned')
+    assert (last['pair'], last['theta']) == ('Z-L - interpolation', 'learned')
+    assert len(alike) == 6
+    for row in alike:
         ours, other = (of_models[f'{name}, {row["theta"]}'] for name in row['pair'].split(' - '))
         for name in ('iou', 'rmse'):
             assert row[f'{name}_difference'] == pytest.approx(ours[name] - other[name])
-            low, high = map(float, row[f'{name}_interval'].removesuffix(' tie').split(' to '))
-            assert low - 0.006 <= 100.0 * row[f'{name}_difference'] <= high + 0.006
 
 
-def test_steps_go_from_the_paper_to_the_defaults():
-    steps = list(experiments.paper_steps().values())
-    assert (steps[0], steps[-1]) == (PRESETS['paper'].config, Config())
-    for before, after in itertools.pairwise(steps):
-        assert before != after
+def test_steps_go_from_the_paper_to_the_parameters_given():
+    for config in (Config(), FIXED):
+        steps = [*experiments.paper_steps(config).values()]
+        assert (steps[0], steps[-1]) == (PRESETS['paper'].config, config)
+        assert all(before != after for before, after in itertools.pairwise(steps))
 
 
 def test_ratios_of_times_pair_each_frame_with_the_peer():
@@ -114,24 +89,6 @@ def test_ratios_of_times_pair_each_frame_with_the_peer():
     assert 'ratio' not in time_tables(scores)['times'].frame
 
 
-def test_speed_runs_every_method_on_every_frame_in_each_pass(frames):
-    """In which order, and what is forgotten between sequences, test_evaluate.py says."""
-    small = Config().replace(**{'grid.n_segments': 8, 'learning.max_evaluations': 1})
-    numpy = small.replace(**{'runtime.backend': 'numpy'})
-    names = ['learning', 'theta fixed', 'Patchwork++', 'learning, numpy', 'theta fixed, numpy']
-    for config, expected in ((small, names), (numpy, names[:3])):
-        rows = experiments.measure_speed(frames, config).rows
-        assert [*dict.fromkeys(row['method'] for row in rows)] == expected
-        wanted = [(frame.sequence, frame.index) for frame in frames] * experiments.N_PASSES
-        for name in expected:
-            own = [row for row in rows if row['method'] == name]
-            assert [(row['sequence'], row['index']) for row in own] == wanted
-            assert all(row['seconds'] > 0.0 for row in own)
-            mode = {'learning': 'every_frame', 'theta fixed': 'fixed'}.get(name.split(',')[0])
-            assert {row['mode'] for row in own} == {mode}
-            assert 'numpy' not in name or {row['backend'] for row in own} == {'numpy'}
-
-
 def test_interpolation_joins_lowest_points_that_are_not_too_steep():
     r, z = np.array([5.0, 6.0, 10.0, 20.0]), np.array([-1.7, -1.0, -1.2, -3.0])
     # 0.7 m within 1 m is an obstacle, 0.5 m within 5 m a slope, and so is 1.8 m down in 10 m not.
@@ -139,7 +96,7 @@ def test_interpolation_joins_lowest_points_that_are_not_too_steep():
 
 
 def test_interpolation_has_the_median_of_three_segments_and_our_labels(frames):
-    scan = runner.load_kitti(frames[0])
+    scan = load_kitti(frames[0])
     plain = InterpolationMethod(Config())
     plain.run(scan.points)
     result = plain.last
@@ -156,19 +113,18 @@ def test_interpolation_has_the_median_of_three_segments_and_our_labels(frames):
     expected = np.median(lines, axis=0)[far]
     np.testing.assert_allclose(surface.mean[segment][far], expected, atol=1e-9)
     assert result.fit.mode == 'fixed'
-    assert iou_of(result.label, scan.truth) > 0.9
+    assert label_ratios(count_labels(result.label, scan.truth))['iou'] > 0.9
 
 
 def test_scenes_without_a_free_lane_are_seen_from_the_origin_only():
-    frames = scenes.simulated_frames(['vlp-16'], ['kerb', 'car_park'], 1, (0.0, 6.0))
-    places = [(frame.scene, frame.x) for frame in frames]
-    assert places == [('kerb', 0.0), ('kerb', 6.0), ('car_park', 0.0)]
+    frames = simulated_frames(['vlp-16'], ['kerb', 'car_park'], 1, (0.0, 6.0))
+    assert [frame[1:] for frame in frames] == [('kerb', 0, 0), ('kerb', 0, 6), ('car_park', 0, 0)]
 
 
 @pytest.mark.parametrize('scene', ['hidden_climb', 'traffic_jam', 'low_boxes'])
 def test_objects_of_a_simulated_scan_are_those_that_its_rays_hit(scene):
     """Vehicles, persons and cyclists by their kind; lower ones by the nearest of five heights."""
-    objects = scenes.load_simulated(scenes.SimulatedFrame('vlp-16', scene, 1, 0.0)).objects
+    objects = load_scan(SimulatedFrame('vlp-16', scene, 1)).objects
     made, solids = simulated(scene, seed=1), scene_of(scene, 1).solids
     heights = object_heights(scene_of(scene, 1).terrain, solids)
     names = {Kind.BOX: 'vehicle', Kind.PERSON: 'person', Kind.CYCLIST: 'cyclist'}
@@ -180,118 +136,127 @@ def test_objects_of_a_simulated_scan_are_those_that_its_rays_hit(scene):
     np.testing.assert_array_equal(objects.object_id, made.object_id)
 
 
-def test_scenes_are_scored_by_ours_and_by_the_peer():
-    frames = scenes.simulated_frames(['vlp-16', 'hdl-64e-vehicle'], ['on_ramp'], 1, (0.0,))
-    report = scenes.score_scenes(frames, FIXED)
-    rows = records(report.tables['scenes'].frame)
-    for frame, row in zip(frames, rows, strict=True):
-        scan, peer = scenes.load_simulated(frame), scenes.peer_of(frame.sensor)
-        ours = GroundSegmenter(FIXED).segment(scan.points)
-        peer.run(scan.points)
-        assert (row['sensor'], row['scene']) == frame[:2]
-        for who, result in (('', ours), ('peer_', peer.result())):
-            error = (result.ground_z - scan.ground_z)[scan.is_ground]
-            assert row[f'{who}iou'] == iou_of(result.label, scan.truth)
-            assert row[f'{who}rmse'] == pytest.approx(np.sqrt(np.nanmean(error**2)))
-            lost = count_objects(scan.points, result.label, scan.objects)
-            own = [one['n_lost'] for one in lost if one['class'] == 'vehicle']
-            assert row[f'{who}lost_vehicles'] == sum(own)
-    assert {one['method'] for one in report.rows} == {OURS, 'Patchwork++'}
-    alone = scenes.score_scenes(frames[:1], FIXED, with_peer=False)
-    (row,) = records(alone.tables['scenes'].frame)
-    assert row.items() <= rows[0].items() and 'peer_iou' not in row
-
-
-def scored_by_hand():
-    """Ours and a peer on three scenes: errors of the height, and objects of two bands."""
-
-    def rows(method, *ious, error, lost):
-        height = height_sums(np.zeros(4), np.array([error, error, -3.0 * error, np.nan]))
-        scans, objects = [], []
-        for scene, iou in zip(('vlp-16 flat', 'vlp-16 ramp', 'os1 ramp'), ious, strict=True):
-            key = {'method': method, 'sequence': scene, 'index': ''}
-            scans.append({
-                **key, **height, 'cluster': scene, 'n_scans': 1, 'n_objects': 6, 'n_lost': lost,
-                'tp': iou, 'fp': 100 - iou, 'fn': 0, 'tn': 0,
-            })  # fmt: skip
-            for name, band in (
-                ('vehicle', '0-10 m'), ('vehicle', '20-40 m'), ('vehicle', '> 40 m'),
-                ('person', '0-10 m'), ('cyclist', '0-10 m'), ('low, 0.3 m', '0-10 m'),
-            ):  # fmt: skip
-                counts = {'n_objects': 2, 'n_lost': lost}
-                objects.append({**key, 'class': name, 'range': band, **counts})
-        return {'scans': scans, 'objects': objects}
-
-    ours = rows(OURS, 90, 80, 70, error=0.1, lost=0)
-    return make_scores([ours, rows('x', 89, 81, 70, error=0.2, lost=1)])
-
-
-def values(row, *names):
-    return [row[f'{who}{name}'] for name in names for who in ('', 'peer_')]
+def scored_by_hand(method, *ious, error, lost):
+    """Rows of a method on three scenes: errors of the height, and objects."""
+    height = height_sums(np.zeros(4), np.array([error, error, -3.0 * error, np.nan]))
+    scans, objects = [], []
+    for scene, iou in zip(('vlp-16 flat', 'vlp-16 ramp', 'os1 ramp'), ious, strict=True):
+        key = {'method': method, 'sequence': scene, 'index': ''}
+        labels = {'tp': iou, 'fp': 100 - iou, 'fn': 0, 'tn': 0}
+        counts = {'n_scans': 1, 'n_objects': 6, 'n_lost': lost}
+        scans.append({**key, 'cluster': scene, **height, **labels, **counts})
+        for name in ('vehicle', 'person', 'cyclist', 'low, 0.3 m'):
+            objects.append({**key, 'class': name, 'n_objects': 2, 'n_lost': lost})
+    return {'scans': scans, 'objects': objects}
 
 
 def test_scenes_by_hand():
     """Of each scan the counts are those of test_objects.py."""
-    scores = scored_by_hand()
-    row = records(scenes._scene_table(scores).frame)[0]
+    ours = scored_by_hand(OURS, 90, 80, 70, error=0.1, lost=0)
+    scores = make_scores([ours, scored_by_hand('x', 89, 81, 70, error=0.2, lost=1)])
+
+    def values(row, *names):
+        return [row[f'{who}{name}'] for name in names for who in ('', 'peer_')]
+
+    row = records(experiments._scene_table(scores).frame)[0]
     assert (row['sensor'], row['scene']) == ('vlp-16', 'flat')
-    assert values(row, 'iou', 'lost_vehicles', 'lost_persons') == [0.9, 0.89, 0, 3, 0, 2]
+    assert values(row, 'iou', 'lost_vehicles', 'lost_persons') == [0.9, 0.89, 0, 1, 0, 2]
     assert values(row, 'rmse') == pytest.approx([*(np.sqrt(11 / 3) * np.array([0.1, 0.2]))])
-    assert (row['vehicles'], row['persons']) == (6, 4)
-    flat, ramp, total = records(scenes._rough_table(scores).frame)
+    assert (row['vehicles'], row['persons']) == (2, 4)
+    flat, ramp, total = records(experiments._rough_table(scores).frame)
     assert [row['scene'] for row in (flat, ramp, total)] == ['flat', 'ramp', 'all']
     names = 'n_scans', 'n_objects', 'n_lost', 'peer_n_lost'
     assert [total[name] for name in names] == [3, 18, 0, 3]
     assert values(ramp, 'iou') + values(total, 'iou') == pytest.approx(
         [0.75, 0.755, 0.825, 0.8225]
     )
-    row = records(scenes._low_table(scores).frame)[0]
+    row = records(experiments._low_table(scores).frame)[0]
     assert row['things'] == 2 and values(row, 'low, 0.3 m') == [0.0, 0.5]
     assert row['low, 0.2 m'] is None
 
 
 def lost_vehicles(sensor, kinds, n_seeds=1):
     """Vehicles, those lost, and the share of the returns on those within 10 m called ground."""
-    frames = scenes.simulated_frames([sensor], kinds, n_seeds, (0.0,))
-    scores = scenes.score_simulated(frames, Config(), with_peer=False)
-    own = scores.objects[scores.objects['class'] == 'vehicle']
-    near = own[own['range'] == '0-10 m']
-    share = near['n_ground'].sum() / near['n_returns'].sum()
-    return own['n_objects'].sum(), own['n_lost'].sum(), share
+    n_objects = n_lost = 0
+    near = []
+    segmenter = GroundSegmenter()
+    for frame in simulated_frames([sensor], kinds, n_seeds, (0.0,)):
+        scan = load_scan(frame)
+        label, objects = segmenter.segment(scan.points).label, scan.objects
+        vehicles, *_ = count_objects(scan.points, label, objects)
+        n_objects, n_lost = n_objects + vehicles['n_objects'], n_lost + vehicles['n_lost']
+        x, y, z = scan.points[:, :3].T.astype(float)
+        on = (objects.class_of == 0) & (z - objects.ground_z >= 0.3) & (np.hypot(x, y) < 10.0)
+        near.append(label[on] == 1)
+    return n_objects, n_lost, np.mean(np.concatenate(near))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ('sensor', 'scene', 'n_seeds'),
-    [
-        ('vlp-32c', 'urban', 8),
-        ('vlp-32c-31', 'urban', 8),
-        ('vlp-32c', 'traffic_jam', 2),
-        ('vlp-32c-31', 'traffic_jam', 8),
-        ('pandar64', 'traffic_jam', 2),
-    ],
-)
-def test_nothing_near_is_taken_for_ground(sensor, scene, n_seeds):
-    """Before candidates joined in doubt it was 0.3 to 1.2 %."""
-    assert lost_vehicles(sensor, [scene], n_seeds)[2] <= 0.001
-
-
-@pytest.mark.slow
-def test_a_sensor_near_the_ground_loses_few_vehicles():
-    """0.15 m over it, of 99 vehicles 20 were lost when what is higher than itself was a seed."""
-    assert lost_vehicles('vlp-16-low', ['traffic_jam', 'car_park'], 2)[1] <= 14
+slow = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
-    'sensor',
+    ('sensor', 'scenes', 'n_seeds', 'most_lost', 'most_near'),
     [
-        'vlp-32c-pair',
-        pytest.param('hdl-64e', marks=pytest.mark.slow),
-        pytest.param('os1-128', marks=pytest.mark.slow),
+        # Nothing near is taken for ground; before candidates joined in doubt it was 0.3 to 1.2 %.
+        pytest.param('vlp-32c', ['urban'], 8, None, 0.001, marks=slow),
+        pytest.param('vlp-32c-31', ['urban'], 8, None, 0.001, marks=slow),
+        pytest.param('vlp-32c', ['traffic_jam'], 2, None, 0.001, marks=slow),
+        pytest.param('vlp-32c-31', ['traffic_jam'], 8, None, 0.001, marks=slow),
+        pytest.param('pandar64', ['traffic_jam'], 2, None, 0.001, marks=slow),
+        # Of 99 vehicles 20 were lost when what is higher than the sensor was a seed.
+        pytest.param('vlp-16-low', ['traffic_jam', 'car_park'], 2, 14, 1.0, marks=slow),
+        # Cars hide the ground near the sensor; docs/accuracy.md has the table.
+        ('vlp-32c-pair', ['traffic_jam'], 1, 0, 0.01),
+        ('vlp-32c-pair', ['car_park'], 1, 0, 0.01),
+        pytest.param('hdl-64e', ['traffic_jam', 'car_park'], 1, 0, 0.01, marks=slow),
+        pytest.param('os1-128', ['traffic_jam', 'car_park'], 1, 0, 0.01, marks=slow),
     ],
 )
-@pytest.mark.parametrize('scene', ['traffic_jam', 'car_park'])
-def test_in_traffic_no_vehicle_is_lost(sensor, scene):
-    """Cars hide the ground near the sensor; docs/accuracy.md has the table."""
-    n_vehicles, n_lost, share = lost_vehicles(sensor, [scene])
-    assert n_vehicles > 20 and n_lost == 0 and share <= 0.01
+def test_hardly_a_vehicle_is_lost_in_traffic(sensor, scenes, n_seeds, most_lost, most_near):
+    n_vehicles, n_lost, share = lost_vehicles(sensor, scenes, n_seeds)
+    assert n_vehicles > 20 and share <= most_near
+    assert most_lost is None or n_lost <= most_lost
+
+
+# Table I: its numbers against their definitions.
+
+SEGMENTS, ROAD = (90, 91), 40
+
+
+def test_columns_of_table_1_follow_their_definitions(tmp_path, monkeypatch):
+    """Rubble ahead, from segment 90 on; all anew from two segmentations, but for the times."""
+    made = simulated('road_then_rubble', 'hdl-32e', seed=1)
+    semantic = semantic_kitti_labels(made.kind)
+    write_frame(tmp_path, '00', 0, made.points, semantic)
+    monkeypatch.setattr(experiments, 'CHOICES', {('00', '000000'): SEGMENTS})
+    monkeypatch.setattr(experiments, 'N_REPEATS', 1)
+    rows = experiments.table1(labelled_frames(tmp_path), Config()).rows
+    assert [row['by'] for row in rows] == ['ours', 'ours', 'preset', 'preset']
+    x, y, z, _ = made.points.T.astype(float)
+    r, azimuth = np.hypot(x, y), np.degrees(np.arctan2(y, x))
+
+    def smse(heights, at):
+        mu = np.interp(at, result.surface.knots, result.surface.mean[segment])
+        return pytest.approx(np.mean((heights - mu) ** 2 / np.var(heights)), rel=1e-6)
+
+    for method, model in (('Z-L', 'latent'), ('Z', 'line_gradient')):
+        changes = {'length_scale.model': model, 'learning.fixed': 'none'}
+        result = GroundSegmenter(Config().replace(**changes)).segment(made.points)
+        candidates, sigma = result.candidates, [*result.fit.theta.values()][:5]
+        for row, segment in zip(rows, SEGMENTS, strict=False):
+            own = slice(*candidates.offsets[segment : segment + 2])
+            assert row['segment'] == f'00/000000:{segment}'
+            assert row['n_PG'] == own.stop - own.start
+            assert row['n_L'] == np.diff(result.pseudo.offsets)[segment]
+            if method == 'Z-L':
+                found = [row[title] for title in experiments.VARIANCES]
+                np.testing.assert_allclose(found, np.square(sigma), rtol=1e-12)
+            inlier = result.surface.inlier[own]
+            expected = smse(candidates.z[own][inlier], candidates.r[own][inlier])
+            assert row[f'in sample {method}'] == expected
+            held_out = (azimuth >= 2 * (segment - 90)) & (azimuth < 2 * (segment - 89)) & (r < 90)
+            held_out &= (semantic == ROAD) & ~np.isin(z, candidates.z[own])
+            assert row['held out n'] == held_out.sum() > 100
+            # The segmenter takes ranges in the precision of the points.
+            assert row[f'held out {method}'] == smse(z[held_out], r[held_out])
+            assert row[f't {method} [s]'] > 0.0

@@ -4,7 +4,6 @@ import itertools
 import json
 import math
 import re
-from collections import Counter
 
 import numpy as np
 import pytest
@@ -14,11 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import GroundSegmenter, Label
-from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.lab.scoring.metrics import GROUND_CLASSES
 from gp_ground_seg.lab.scoring.objects import (
-    BAND_EDGES,
-    BAND_TITLES,
     CLASSES,
     LOW_CLASSES,
     MIN_HEIGHT,
@@ -33,45 +28,29 @@ from gp_ground_seg.lab.scoring.objects import (
 )
 
 
-def test_objects_are_those_of_the_points():
-    ones = np.ones(10, dtype=int)
-    objects = Objects(ones, ones[:3], 0.0 * ones)
-    with pytest.raises(PointCloudError, match=r'object_id of shape \(3,\) for 10 points'):
-        count_objects(np.zeros((10, 3)), ones, objects)
-
-
 def counted_by_loops(points, label, objects):
     """Count as the module says it does, one return after the other."""
     share, own = {}, {}
-    for k, (x, y, z) in enumerate(points):
-        kind, number = objects.class_of[k], objects.object_id[k]
-        reach, is_ground = math.hypot(x, y), label[k] == Label.GROUND
-        if math.isinf(reach):
+    for k, (x, _, z) in enumerate(points):
+        kind, number, is_ground = objects.class_of[k], objects.object_id[k], label[k] == 1
+        if math.isinf(x) or kind < 0:
             continue
-        if kind < 0 or not z - objects.ground_z[k] >= (0.1 if kind >= 3 else MIN_HEIGHT):
+        if not z - objects.ground_z[k] >= (0.1 if kind >= 3 else MIN_HEIGHT):
             continue
-        share.setdefault((kind, band_of(reach)), []).append(is_ground)
+        share.setdefault(kind, []).append(is_ground)
         if number:
-            own.setdefault((kind, number), []).append((reach, is_ground))
+            own.setdefault((kind, number), []).append(is_ground)
     found = {}
     for (kind, _), its in own.items():
         if len(its) >= (3 if kind >= 3 else MIN_RETURNS):
-            band = band_of(np.median([reach for reach, _ in its]))
-            is_lost = sum(is_ground for _, is_ground in its) > len(its) / 2
-            found.setdefault((kind, band), []).append(is_lost)
+            found.setdefault(kind, []).append(sum(its) > len(its) / 2)
     return [
-        {'class': name, 'range': title, **dict(zip(OBJECT_COUNTS, (
-            number for counted in (share, found)
-            for own in [counted.get((kind, band), [])] for number in (len(own), sum(own))
+        {'class': [*CLASSES][kind], **dict(zip(OBJECT_COUNTS, (
+            number for its in (share[kind], found.get(kind, []))
+            for number in (len(its), sum(its))
         ), strict=True))}
-        for kind, name in enumerate(CLASSES)
-        if any(k == kind for k, _ in share)
-        for band, title in enumerate(BAND_TITLES)
+        for kind in sorted(share)
     ]  # fmt: skip
-
-
-def band_of(reach):
-    return next(k for k, far in enumerate(BAND_EDGES[1:]) if reach < far)
 
 
 def drawn_scan(seed, n):
@@ -233,45 +212,31 @@ def street_with_cars(seed):
     return np.concatenate(parts).astype('<f4'), np.concatenate(entries)
 
 
-def write_cars(root, *sequences):
-    for k, name in enumerate(sequences):
-        points, entries = street_with_cars(k)
-        write_frame(root, name, k, points, entries)
-    return root
-
-
-def evaluated(root, folder, *words):
-    assert run('evaluate', root, '--json', folder / 'a.json', '--force', *words) == 0
-    return json.loads((folder / 'a.json').read_text())
-
-
 def test_tables_of_objects_low_things_and_false_cells_are_those_of_the_labels(tmp_path, capsys):
     """Both cars whole, and cut at 1 m; segmented by the library."""
-    root = write_cars(tmp_path / 'kitti', '00', '08')
-    document = evaluated(root, tmp_path, '--peer', 'patchworkpp', '--cut', 1)
-    assert re.search(r'^vehicle +all +\d .* 4 +0 +\d', capsys.readouterr().out, re.MULTILINE)
-    segmenter, found, sums = GroundSegmenter(), Counter(), Counter()
-    for k in range(2):
-        points, entries = street_with_cars(k)
-        is_ground, is_car = entries == 40, entries & 0xFFFF == 10
-        result = segmenter.segment(points)
-        objects = labelled_objects(points, entries, is_ground)
-        for row in count_objects(points, result.label, objects):
-            for band in (row['range'], 'all'):
-                found.update({(band, name): row[name] for name in OBJECT_COUNTS})
-        cut = cut_objects(points, is_car, is_ground, 1.0)
-        assert 50 < (~cut.is_kept).sum() < 500 and cut.is_low.sum() > 50
-        sums.update(cut.count_ground(segmenter.segment(points[cut.is_kept]).label))
-        sums.update(count_false_cells(points, result.label, result.height, entries & 0xFFFF))
-    for row in document['objects']:
-        own = {n: found[row['range'], n] for n in OBJECT_COUNTS}
-        assert [row[n] for n in ('n_returns', 'n_objects')] == [own['n_returns'], own['n_objects']]
-        share = own['n_ground'] / own['n_returns'] if own['n_returns'] else None
-        assert row['share_ground'] == share
-        assert row['n_lost'] == (own['n_lost'] if own['n_objects'] else None)
-    assert (row['range'], row['n_objects'], row['n_lost']) == ('all', 4, 0)
-    assert row['peer_share_ground'] is not None and ' to ' in row['interval']
-    assert all(scan['n_objects'] == 2 for scan in document['rows'])
+    points, entries = street_with_cars(0)
+    write_frame(tmp_path / 'kitti', '00', 0, points, entries)
+
+    def evaluated(*words):
+        target = tmp_path / 'a.json'
+        assert run('evaluate', tmp_path / 'kitti', '--json', target, '--force', *words) == 0
+        return json.loads(target.read_text())
+
+    document = evaluated('--peer', 'patchworkpp', '--cut', 1)
+    assert re.search(r'^vehicle +\d.* 2 +0 +\d', capsys.readouterr().out, re.MULTILINE)
+    is_ground, segment = entries == 40, GroundSegmenter().segment
+    result = segment(points)
+    rows = count_objects(points, result.label, labelled_objects(points, entries, is_ground))
+    (row,), (own,) = document['objects'], rows
+    names = 'class', 'n_returns', 'n_objects', 'n_lost'
+    assert [row[name] for name in names] == [own[name] for name in names]
+    assert row['share_ground'] == own['n_ground'] / own['n_returns']
+    assert (row['n_objects'], row['n_lost']) == (2, 0) and row['peer_share_ground'] is not None
+
+    cut = cut_objects(points, entries & 0xFFFF == 10, is_ground, 1.0)
+    assert 50 < (~cut.is_kept).sum() < 500 and cut.is_low.sum() > 50
+    sums = cut.count_ground(segment(points[cut.is_kept]).label)
+    sums |= count_false_cells(points, result.label, result.height, entries & 0xFFFF)
     pooled = document['low_things'][-1]
     assert document['cut'] == 1.0
     for name in ('low_things', 'road_cells', 'ground_cells'):
@@ -279,20 +244,4 @@ def test_tables_of_objects_low_things_and_false_cells_are_those_of_the_labels(tm
         assert (pooled[f'{name}_n'], pooled[name]) == (n, n_wrong / n)
     # The peer has no heights over a surface.
     assert pooled['peer_road_cells'] is None and pooled['peer_low_things'] is not None
-    assert 'low_things_n' not in evaluated(root, tmp_path, '--cut', 0)['low_things'][0]
-
-
-def test_labels_without_objects_instances_or_ground(tmp_path):
-    points, entries = street_with_cars(0)
-    classes = entries & np.uint32(0xFFFF)
-    groundless = np.where(np.isin(classes, GROUND_CLASSES), 0, entries).astype('<u4')
-    found = {}
-    for name, scan in {
-        'none': street(), 'no number': (points, classes), 'no ground': (points, groundless)
-    }.items():  # fmt: skip
-        write_frame(tmp_path / name, '00', 0, *scan)
-        found[name] = evaluated(tmp_path / name, tmp_path).get('objects')
-    assert found['none'] is found['no ground'] is None
-    row = found['no number'][-1]
-    assert row['range'] == 'all' and row['n_returns'] > 300 and row['share_ground'] is not None
-    assert (row['n_objects'], row['n_lost']) == (0, None)
+    assert 'low_things_n' not in evaluated('--cut', 0)['low_things'][0]

@@ -2,8 +2,6 @@
 
 import json
 import math
-import os
-import platform
 import subprocess
 
 import numpy as np
@@ -26,7 +24,6 @@ TABLE = Table(
         'name': Form('sequence'), 'points': Form('points', ',.0f'),
         'iou': Form('IoU [%]', '.2f', 100.0), 'change': Form('change', '+.1f', 100.0),
     },
-    ['a note'],
 )  # fmt: skip
 CELLS = [
     ['sequence', 'points', 'IoU [%]', 'peer IoU [%]', 'change'],
@@ -37,11 +34,11 @@ CELLS = [
 
 
 def test_forms_of_a_table():
-    title, *lines, note = TABLE.text().splitlines()
-    assert (title, note) == ('Scores', 'a note')
+    title, *lines = TABLE.text().splitlines()
+    assert title == 'Scores'
     assert [line.split() for line in lines] == [' '.join(row).split() for row in CELLS]
     assert len({*map(len, lines)}) == 1
-    title, table, note = TABLE.text(markdown=True).split('\n\n')
+    title, table = TABLE.text(markdown=True).split('\n\n')
     titles, rule, *rows = (line.split('|')[1:-1] for line in table.splitlines())
     assert [[cell.strip() for cell in row] for row in (titles, *rows)] == CELLS
     assert [mark[-1] == ':' for mark in rule] == [False, True, True, True, True]
@@ -50,12 +47,6 @@ def test_forms_of_a_table():
         {'name': '08', 'points': None, 'iou': None, 'peer_iou': 2e-20, 'change': None},
         {'name': 'all', 'points': 1234572, 'iou': 0.5, 'peer_iou': None, 'change': 0.25},
     ]
-
-
-def test_no_rows_have_no_titles():
-    table = Table('title', report.frame_of([], ['a']), {}, ['nothing'])
-    assert table.text() == 'title\nnothing'
-    assert report.records(table.frame) == []
 
 
 def test_json_files_have_null_for_what_is_undefined(tmp_path):
@@ -74,14 +65,11 @@ def test_json_files_have_null_for_what_is_undefined(tmp_path):
 
 def test_the_environment_is_recorded():
     environment = report.describe_environment('no-such-package')
-    assert environment['versions']['gp_ground_seg'] == __version__
-    assert environment['versions']['no-such-package'] is None
-    assert environment['n_cores'] == len(os.sched_getaffinity(0))
-    assert environment['python'] == platform.python_version()
-    assert environment['cpu']
-    line = report.machine_line(
-        {**environment, 'n_cores': 1, 'commit': f'{"a" * 40}-dirty'}, 'numba'
-    )
+    assert environment['versions'].items() >= {
+        'gp_ground_seg': __version__, 'no-such-package': None
+    }.items()  # fmt: skip
+    environment |= {'n_cores': 1, 'commit': f'{"a" * 40}-dirty'}
+    line = report.machine_line(environment, 'numba')
     assert ', 1 thread on 1 core, numba; Python' in line and 'no-such-package absent' in line
     assert line.endswith(f'commit {"a" * 12} (changed since)')
     assert 'commit' not in report.machine_line({**environment, 'commit': None}, 'numpy')

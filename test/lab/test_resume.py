@@ -10,16 +10,19 @@ from cli_runner import error_line, run
 from evaluation_samples import label_files, write_two_drives
 
 from gp_ground_seg import __version__
-from gp_ground_seg.cli import options
 from gp_ground_seg.cli import segment as command
+from gp_ground_seg.data.files import write_file
 from gp_ground_seg.lab.dataset import PARAMETERS
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
 
 @pytest.fixture(scope='module')
-def root(tmp_path_factory):
-    return write_two_drives(tmp_path_factory.mktemp('root'))
+def segmented(tmp_path_factory):
+    """A data set, and the folder into which it has been segmented."""
+    root = write_two_drives(tmp_path_factory.mktemp('root'))
+    assert run('segment', root, '-o', root.parent / 'out', '--quiet') == 0
+    return root, root.parent / 'out'
 
 
 def times(folder):
@@ -27,37 +30,19 @@ def times(folder):
 
 
 def test_several_bags_become_one_each(tmp_path, capsys):
-    names = ['a', 'b']
-    for k, name in enumerate(names):
-        write_ros2_bag(tmp_path / f'{name}.mcap', n_clouds=2 + k)
-        assert run('segment', tmp_path / f'{name}.mcap', '--quiet') == 0
-    bags = [tmp_path / f'{name}.mcap' for name in names]
-    words = ['segment', *bags, '-o', tmp_path / 'out']
+    bags, out = [tmp_path / 'a.mcap', tmp_path / 'b.mcap'], tmp_path / 'out'
+    for k, bag in enumerate(bags):
+        write_ros2_bag(bag, n_clouds=2 + k)
+        assert run('segment', bag, '--quiet') == 0
+    words = ['segment', *bags, '-o', out]
     assert run(*words) == 0
-    for name in names:
-        file = f'{name}_ground.mcap'
-        assert (tmp_path / 'out' / file).read_bytes() == (tmp_path / file).read_bytes()
+    for name in ('a_ground.mcap', 'b_ground.mcap'):
+        assert (out / name).read_bytes() == (tmp_path / name).read_bytes()
     assert '5 frames' in capsys.readouterr().out
-    assert run(*words) == 0
-    assert capsys.readouterr().out == '2 of 2 were finished before\n'
     bags[1].unlink()
     write_ros2_bag(bags[1], n_clouds=4)
     assert run(*words) == 0
     assert capsys.readouterr().out.startswith('1 of 2 were finished before\n4 frames, ')
-
-
-def test_what_is_there_is_kept_and_replaced_with_force_only(root, tmp_path, capsys):
-    out = tmp_path / 'out'
-    assert run('segment', root, '-o', out) == 0
-    before, known = label_files(out), times(out)
-    assert run('segment', root, '-o', out) == 0
-    assert capsys.readouterr().out.endswith('12 of 12 were finished before\n')
-    assert times(out) == known
-    words = ['segment', root, '-o', out, '--set', 'label.ground_tolerance=0.2', '--force']
-    assert run(*words) == 0
-    assert label_files(out) != before and len(label_files(out)) == 12
-    assert run('config', 'check', out / PARAMETERS) == 0
-    assert '1 differs from the defaults' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -70,16 +55,16 @@ def test_what_is_there_is_kept_and_replaced_with_force_only(root, tmp_path, caps
     ],
 )
 def test_other_parameters_are_refused(
-    more, version, before, now, root, tmp_path, monkeypatch, capsys
+    more, version, before, now, segmented, tmp_path, monkeypatch, capsys
 ):
-    """The line says what differs, and what to do."""
-    out, other = tmp_path / 'out', tmp_path / 'other'
+    """The line says what differs, and what to do; the same words again change nothing."""
+    (root, out), other = segmented, tmp_path / 'other'
     shutil.copytree(root, other)
-    assert run('segment', root, '-o', out) == 0
     known = times(out)
+    assert run('segment', root, '-o', out) == 0
+    assert capsys.readouterr().out == '12 of 12 were finished before\n'
     if version:
         monkeypatch.setattr(command, '__version__', version)
-    capsys.readouterr()
     source = other if more == 'OTHER' else root
     assert run('segment', source, '-o', out, *more.replace('OTHER', '').split()) == 2
     said = error_line(capsys)
@@ -90,22 +75,8 @@ def test_other_parameters_are_refused(
     assert said.endswith('; give another output folder, or --force to start anew')
 
 
-def test_a_folder_goes_on_with_the_backend_that_it_was_begun_with(root, tmp_path, monkeypatch):
-    """Whatever has been compiled meanwhile; values differ in their last digits."""
-    source, out, whole = root / 'sequences/00', tmp_path / 'out', tmp_path / 'whole'
-    monkeypatch.setattr(options, 'has_to_compile', lambda: True)
-    for folder in (out, whole):
-        assert run('segment', source, '-o', folder, '--format', 'ply') == 0
-    (out / '000003.ply').unlink()
-    monkeypatch.setattr(options, 'has_to_compile', lambda: False)
-    assert run('segment', source, '-o', out, '--format', 'ply') == 0
-    for file in whole.glob('*.ply'):
-        assert (out / file.name).read_bytes() == file.read_bytes()
-    assert 'backend: numpy' in (out / PARAMETERS).read_text()
-
-
-def test_what_is_missing_or_older_than_its_input_is_done_again(root, tmp_path, capsys):
-    source, out = tmp_path / 'root', tmp_path / 'out'
+def test_what_is_missing_or_older_than_its_input_is_done_again(segmented, tmp_path, capsys):
+    (root, _), source, out = segmented, tmp_path / 'root', tmp_path / 'out'
 
     def said(*words):
         capsys.readouterr()
@@ -114,10 +85,12 @@ def test_what_is_missing_or_older_than_its_input_is_done_again(root, tmp_path, c
 
     shutil.copytree(root, source)
     inputs = sorted(source.rglob('*.bin'))
-    os.truncate(inputs[9], 10)
-    assert run('segment', source, '-o', out) == 2
-    assert f'{inputs[9]}: 10 bytes is not a whole number' in error_line(capsys)
-    shutil.copyfile(inputs[0], inputs[9])
+    for k, words in ((0, ['--preset', 'paper']), (9, [])):
+        # The first writes nothing: other parameters are no matter then.
+        os.truncate(inputs[k], 10)
+        assert run('segment', source, '-o', out, *words) == 2
+        assert f'{inputs[k]}: 10 bytes is not a whole number' in error_line(capsys)
+        shutil.copyfile(inputs[1], inputs[k])
     assert said('-o', out).startswith('9 of 12 were finished before\n3 frames, ')
     outputs = sorted(out.rglob('*.label'))
     shutil.copyfile(inputs[7], inputs[0])
@@ -135,9 +108,16 @@ def test_what_is_missing_or_older_than_its_input_is_done_again(root, tmp_path, c
     (out / PARAMETERS).touch()
     outputs[0].touch()
     assert said('-o', out).startswith('1 of 11 were finished before\n10 frames, ')
+    known = label_files(out)
+    (out / 'readme').write_text('mine')
+    said('-o', out, '--set', 'label.ground_tolerance=0.2', '--force')
+    assert label_files(out) != known and label_files(out).keys() == known.keys()
+    assert (out / 'readme').read_text() == 'mine'
+    assert run('config', 'check', out / PARAMETERS) == 0
+    assert '1 differs from the defaults' in capsys.readouterr().out
 
 
-def test_a_file_has_its_name_when_it_is_on_disk(root, tmp_path, monkeypatch):
+def test_a_file_has_its_name_when_it_is_on_disk(tmp_path, monkeypatch):
     """A power failure leaves no hole in what is finished."""
     calls, sync, rename = [], os.fsync, os.rename
 
@@ -146,15 +126,11 @@ def test_a_file_has_its_name_when_it_is_on_disk(root, tmp_path, monkeypatch):
         calls.append(Path(os.readlink(f'/proc/self/fd/{number}')))
 
     def note_rename(source, target):
-        assert source in calls
         rename(source, target)
-        calls.append(target)
+        calls.append((source, target))
 
     monkeypatch.setattr(os, 'fsync', note_sync)
     monkeypatch.setattr(os, 'rename', note_rename)
-    out = tmp_path / 'out'
-    assert run('segment', root, '-o', out) == 0
-    written = [out / PARAMETERS, *(out / name for name in label_files(out))]
-    assert len(written) == 13
-    for path in written:
-        assert path.parent in calls[calls.index(path) :]
+    write_file(tmp_path / 'a', b'1')
+    part, (renamed, target), folder = calls
+    assert (part, target, folder) == (renamed, tmp_path / 'a', tmp_path)

@@ -54,17 +54,6 @@ def test_package_xml_is_that_of_this_package(package):
     assert launched <= depends | {'pathlib', 'yaml', PACKAGE}
 
 
-def test_package_xml_has_its_elements_in_the_order_of_rep_149(package):
-    order = ['name', 'version', 'description', 'maintainer', 'license', 'url', 'author']
-    tags = [element.tag for element in package]
-    first = [tag for tag in tags if tag in order]
-    assert first == sorted(first, key=order.index) == tags[: len(first)]
-    depends = [k for k, tag in enumerate(tags) if tag.endswith('depend')]
-    assert tags[-1] == 'export' and depends == [*range(depends[0], len(tags) - 1)]
-    names = [package[k].text for k in depends]
-    assert len(set(names)) == len(names)
-
-
 def test_one_version(package):
     """Of the newest section of the changelog as well, unless that is of the next release."""
     version = gp_ground_seg.__version__
@@ -117,16 +106,6 @@ def test_every_public_name_is_there():
     assert dir(gp_ground_seg) == sorted(gp_ground_seg.__all__)
     with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
         gp_ground_seg.Nothing  # noqa: B018
-
-
-def test_no_path_of_one_machine_and_no_data_is_tracked():
-    listed = subprocess.run(
-        ['git', 'ls-files'], cwd=REPOSITORY, capture_output=True, text=True, check=False
-    )
-    if listed.returncode:
-        pytest.skip('not a git checkout')
-    files = listed.stdout.split()
-    assert not [name for name in files if name.endswith(('.bin', '.label', '.mcap', '.db3'))]
 
 
 def test_what_others_can_change_is_named_by_its_digest():

@@ -1,4 +1,4 @@
-"""README from top to bottom in one clone: its commands, the demo, and the tests."""
+"""README from top to bottom in one clone: its commands, the demo, and some tests."""
 
 import os
 import re
@@ -14,8 +14,13 @@ pytestmark = pytest.mark.slow
 NOT_OF_A_NEWCOMER = ('MAKE', 'MFLAGS', 'VENV', 'VIRTUAL_ENV', 'PYTHON', 'PYTEST', 'GP_GROUND_SEG')
 
 
+# All tests would take minutes, and run in the checkout.
+SOME_TESTS = {'PYTEST_ADDOPTS': 'test/data test/repo'}
+
+
 def newcomer() -> dict[str, str]:
-    return {k: v for k, v in os.environ.items() if not k.startswith(NOT_OF_A_NEWCOMER)}
+    own = {k: v for k, v in os.environ.items() if not k.startswith(NOT_OF_A_NEWCOMER)}
+    return {**own, **SOME_TESTS}
 
 
 def try_it() -> list[str]:

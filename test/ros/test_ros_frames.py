@@ -1,5 +1,6 @@
 """Tilt of the sensor by TF, and what of it is seen outside: nothing but better labels."""
 
+import contextlib
 import dataclasses
 import importlib.util
 import math
@@ -21,7 +22,7 @@ from sensor_msgs.msg import Imu
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.pipeline.points import angles_of, rotation
+from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.lab.simulation import VLP_16, simulate_scan
 from gp_ground_seg.ros import transforms
 from gp_ground_seg.ros.transforms import rotation_of
@@ -35,8 +36,7 @@ TILT = 0.35, -0.2
 
 
 def quaternion(matrix):
-    x, y, z, w = Rotation.from_matrix(matrix).as_quat()
-    return Quaternion(x=x, y=y, z=z, w=w)
+    return Quaternion(**dict(zip('xyzw', Rotation.from_matrix(matrix).as_quat(), strict=True)))
 
 
 def turned_street():
@@ -60,17 +60,12 @@ def check_levelled(points, message, parts):
 
 
 @given(st.floats(-3.14, 3.14), st.floats(-1.5, 1.5), st.floats(-3.14, 3.14))
-def test_tilt_of_a_quaternion_is_roll_and_pitch_whatever_the_heading(roll, pitch, yaw):
+def test_a_quaternion_that_may_be_rounded_is_its_rotation(roll, pitch, yaw):
     turn = Rotation.from_euler('z', yaw).as_matrix() @ rotation(roll, pitch)
-    found = angles_of(rotation_of(quaternion(turn))[2])
-    # As rotations: at the ends of the range angles jump, what they mean does not.
-    np.testing.assert_allclose(rotation(*found), rotation(roll, pitch), atol=3e-5)
-    fixed_axes = Rotation.from_matrix(turn).as_euler('xyz')[:2]
-    np.testing.assert_allclose(rotation(*found), rotation(*fixed_axes), atol=3e-5)
-    # What is rounded is a rotation all the same.
-    q = quaternion(turn)
-    rounded = rotation_of(Quaternion(**{name: 1.0003 * getattr(q, name) for name in 'xyzw'}))
-    np.testing.assert_allclose(rounded, turn, atol=1e-9)
+    exact = quaternion(turn)
+    for scale in (1.0, 1.0003):
+        found = rotation_of(Quaternion(**{name: scale * getattr(exact, name) for name in 'xyzw'}))
+        np.testing.assert_allclose(found, turn, atol=1e-9)
 
 
 @pytest.mark.parametrize('w', [0.0, 2.0, math.nan])
@@ -85,215 +80,196 @@ class StandInBuffer:
     tf2_ros has no wheel, nor have its messages; where it is installed, the last test runs it.
     """
 
-    known: dict = {}  # noqa: RUF012
-    newest = 100  # stamp up to which it knows all [s]
-    place = 0.0, 0.0, 0.0
-    cleared = 0
+    def __init__(self):
+        self.known = {}  # matrices of rotations
+        self.newest = 100  # stamp up to which it knows all [s]
+        self.place = 0.0, 0.0, 0.0
+        self.n_cleared = self.n_listeners = 0
 
     def lookup_transform(self, target, source, time):
         if (target, source) not in self.known:
             raise LookupError(f'"{target}" passed to lookupTransform does not exist')
         if time.nanoseconds > self.newest * 10**9:
             raise IndexError('would require extrapolation into the future')
-        transform = Transform(rotation=self.known[target, source])
+        transform = Transform(rotation=quaternion(self.known[target, source]))
         transform.translation.x, transform.translation.y, transform.translation.z = self.place
         return types.SimpleNamespace(transform=transform)
 
     def clear(self):
-        type(self).cleared += 1
+        self.n_cleared += 1
         self.known.clear()
 
-
-class StandInListener:
-    alive = 0
-
-    def __init__(self, buffer, node, *, spin_thread=False):
+    def listen(self, _buffer, _node, *, spin_thread):
         assert not spin_thread
-        type(self).alive += 1
+        self.n_listeners += 1
+        return types.SimpleNamespace(unregister=self.unregister)
 
     def unregister(self):
-        type(self).alive -= 1
+        self.n_listeners -= 1
 
 
 @pytest.fixture
-def stand_in(monkeypatch):
+def tf(monkeypatch):
+    """What TF knows."""
+    buffer = StandInBuffer()
+    parts = {'Buffer': lambda: buffer, 'TransformListener': buffer.listen}
     errors = {'TransformException': LookupError, 'ExtrapolationException': IndexError}
-    parts = {'Buffer': StandInBuffer, 'TransformListener': StandInListener, **errors}
-    monkeypatch.setitem(sys.modules, 'tf2_ros', types.SimpleNamespace(**parts))
-    monkeypatch.setattr(StandInBuffer, 'known', {})
+    monkeypatch.setitem(sys.modules, 'tf2_ros', types.SimpleNamespace(**parts, **errors))
+    return buffer
 
 
-@pytest.mark.usefixtures('stand_in')
-def test_tilt_by_tf_is_as_good_as_given():
+def cloud_of(points, seconds, nanosec=0):
+    return to_message(points, stamp=(seconds, nanosec), frame='tilted_lidar')
+
+
+def test_tilt_by_tf_is_as_good_as_given(tf):
     points, turn = turned_street()
-    by_tf = {**VALUES, 'frame.level': 'tf', 'diagnostics.period': 0.1}
-    with bench(*ros.given(by_tf)) as b:
+    with bench({**VALUES, 'frame.level': 'tf'}) as b:
         # Not known yet: refused with the names of both frames, and the node goes on.
-        message = to_message(points, stamp=(3, 4), frame='tilted_lidar')
-        b.publisher.publish(message)
+        b.publisher.publish(cloud_of(points, 3))
         status = b.wait_for_status('input', lambda v, s: 'no transform' in s.message)
         assert "'tilted_lidar'" in status.message
         assert "frame.base = 'base_link'" in status.message
-        StandInBuffer.known['base_link', 'tilted_lidar'] = quaternion(turn)
-        check_levelled(points, message, b.segment(message))
-        # Newer than what TF knows: the newest is taken.
-        late = to_message(points, stamp=(1000, 0), frame='tilted_lidar')
-        check_levelled(points, late, b.segment(late))
-        # And back: by a little all is kept; to the start of a bag what moved is forgotten, and
-        # clouds are refused until TF sends anew.
-        cleared = StandInBuffer.cleared
-        early = to_message(points, stamp=(999, 400_000_000), frame='tilted_lidar')
-        check_levelled(points, early, b.segment(early))
-        assert StandInBuffer.cleared == cleared
-        n_before = len(b.ground.messages)
-        b.publisher.publish(to_message(points, stamp=(3, 4), frame='tilted_lidar'))
+        tf.known['base_link', 'tilted_lidar'] = turn
+        # The second is newer than what TF knows: the newest is taken. And back by a little: all is
+        # kept.
+        for message in (
+            cloud_of(points, 3),
+            cloud_of(points, 1000),
+            cloud_of(points, 999, 4 * 10**8),
+        ):
+            check_levelled(points, message, b.segment(message))
+        assert not tf.n_cleared
+        # Back to the start of a bag what moved is forgotten, and clouds are refused until TF sends
+        # anew.
+        b.publisher.publish(cloud_of(points, 3))
         b.wait_for_status('input', lambda values, _: values['Refused since startup'] == '2')
-        assert StandInBuffer.cleared == cleared + 1
-        assert len(b.ground.messages) == n_before
+        assert (tf.n_cleared, len(b.ground.messages)) == (1, 3)
         # The next transform counts.
-        StandInBuffer.known['base_link', 'tilted_lidar'] = quaternion(np.eye(3))
+        tf.known['base_link', 'tilted_lidar'] = np.eye(3)
         label = SEGMENTER.segment(xyz_of(points), (0.0, 0.0)).label
-        assert b.segment(message)[0].width == (label == Label.GROUND).sum()
-        assert b.set('frame.level', 'sensor').successful
-        assert StandInListener.alive == 0
-        assert b.set('frame.level', 'tf').successful
-        assert StandInListener.alive == 1
+        assert b.segment(cloud_of(points, 3))[0].width == (label == Label.GROUND).sum()
+        for level, n_listeners in (('sensor', 0), ('tf', 1)):
+            assert not b.set('frame.level', level)
+            assert tf.n_listeners == n_listeners
 
 
-@pytest.mark.usefixtures('stand_in')
-def test_clouds_wait_for_the_transform_of_their_stamp(monkeypatch):
+def test_clouds_wait_for_the_transform_of_their_stamp(monkeypatch, tf):
     """And keep their order: for a base that pitches, the newest transform so far is wrong."""
     monkeypatch.setattr(transforms, 'MAX_WAIT', 60.0)
-    monkeypatch.setattr(StandInBuffer, 'newest', 2)
-    way = 'base_link', 'tilted_lidar'
-    monkeypatch.setattr(StandInBuffer, 'known', {way: quaternion(rotation(1.0, 0.5))})
+    way, tf.newest = ('base_link', 'tilted_lidar'), 2
+    tf.known[way] = rotation(1.0, 0.5)
     points, turn = turned_street()
-    values = {**VALUES, 'frame.level': 'tf'}
-    values[f'qos_overrides.{ros.NAMESPACE}/points.subscription.depth'] = 5
-    with bench(*ros.given(values)) as b:
-        messages = [to_message(points, stamp=(3, n), frame='tilted_lidar') for n in range(2)]
+    depth = {f'qos_overrides.{ros.NAMESPACE}/points.subscription.depth': 5}
+    with bench({**VALUES, 'frame.level': 'tf', **depth}) as b:
+        messages = [cloud_of(points, 3, n) for n in range(2)]
         for message in messages:
             b.publisher.publish(message)
         wait_for(lambda: b.node._frames and len(b.node._frames._waiting) == 2, 'clouds that wait')
         assert not b.ground.messages
-        StandInBuffer.known = {way: quaternion(turn)}
-        StandInBuffer.newest = 100
+        tf.known[way], tf.newest = turn, 100
         for k, message in enumerate(messages):
             check_levelled(points, message, (b.ground.wait(2)[k], b.obstacles.wait(2)[k]))
         assert not b.node._frames._waiting
 
 
-@pytest.mark.usefixtures('stand_in')
-def test_place_of_the_sensor_by_tf():
+def test_place_of_the_sensor_by_tf(tf):
     """A room in the frame of a vehicle: which of its planes is the floor, the origin tells."""
     sensor = dataclasses.replace(VLP_16, n_columns=600, height=1.2)
     xyz = simulate_scan(ROOM, sensor, np.random.default_rng(0)).points[:, :3]
     points = ros.moved(street(len(xyz)), xyz + np.array([0.0, 0.0, 1.2]))
-    values = {'learning.mode': 'fixed', 'frame.sensor': 'lidar', 'diagnostics.period': 0.1}
-    with bench(*ros.given(values)) as b:
+    with bench({'learning.mode': 'fixed', 'frame.sensor': 'lidar'}) as b:
         message = to_message(points, stamp=(3, 4), frame='base_footprint')
         b.publisher.publish(message)
         status = b.wait_for_status('input', lambda v, s: 'no transform' in s.message)
         assert "frame.sensor = 'lidar'" in status.message and 'base_footprint' in status.message
-        for x, reason in ((math.nan, 'its translation is (nan'), (0.0, '')):
-            StandInBuffer.known['base_footprint', 'lidar'] = quaternion(np.eye(3))
-            StandInBuffer.place = x, 0.0, 1.2
-            if reason:
-                b.publisher.publish(message)
-                b.wait_for_status('input', lambda v, s, reason=reason: reason in s.message)
+        tf.known['base_footprint', 'lidar'], tf.place = np.eye(3), (math.nan, 0.0, 1.2)
+        b.publisher.publish(message)
+        b.wait_for_status('input', lambda v, s: 'its translation is (nan' in s.message)
+        tf.place = 0.0, 0.0, 1.2
         assert b.segment(message)[0].width > 0.05 * len(points)
         b.wait_for_status('model', lambda v, s: v['Taken from the scan'] == 'height')
         # Without it the height is not known, and nothing is ground.
-        n_alive = StandInListener.alive
-        assert b.set('frame.sensor', 'none').successful
-        assert StandInListener.alive == n_alive - 1
+        assert not b.set('frame.sensor', 'none')
+        assert tf.n_listeners == 0
         assert b.segment(message)[0].width == 0
 
 
-@pytest.mark.usefixtures('stand_in')
-def test_the_crop_box_is_in_the_base_of_tf(monkeypatch):
+def test_the_crop_box_is_in_the_base_of_tf(tf):
     points, turn = turned_street()
-    place = np.array([0.5, -0.3, 1.73])
+    tf.known['base_link', 'tilted_lidar'], tf.place = turn, (0.5, -0.3, 1.73)
     box = np.array([-9.0, 9.0, -5.0, 6.0, -0.5, 2.0])
-    monkeypatch.setattr(StandInBuffer, 'known', {('base_link', 'tilted_lidar'): quaternion(turn)})
-    monkeypatch.setattr(StandInBuffer, 'place', tuple(place))
-    in_base = xyz_of(points).astype(np.float64) @ turn.T + place
+    in_base = xyz_of(points).astype(np.float64) @ turn.T + tf.place
     inside = ((in_base > box[::2]) & (in_base < box[1::2])).all(axis=1)
     values = {**VALUES, 'frame.level': 'tf', 'input.crop_box': box.tolist()}
-    message = to_message(points, stamp=(3, 4), frame='tilted_lidar')
+    message = cloud_of(points, 3)
     rows = ros.rows_of(message)
-    with bench(*ros.given(values)) as b:
+    with bench(values) as b:
         found = sorted(row for part in b.segment(message) for row in ros.rows_of(part))
     assert 200 < inside.sum() < 3000
     assert found == sorted(row for row, is_body in zip(rows, inside, strict=True) if not is_body)
 
 
-class ImuProbe:
-    """Sends clouds of a turned street, and orientations, to a node that takes both."""
+@contextlib.contextmanager
+def bench_with_imu():
+    """A node that takes the tilt of an IMU, and a function that sends an orientation to it."""
+    with bench({**VALUES, 'frame.level': 'imu'}) as b:
+        publisher = b.probe.create_publisher(Imu, 'imu', ros.BEST_EFFORT)
+        wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription of imu')
 
-    def __init__(self, bench, points):
-        self.bench, self.points = bench, points
-        self.publisher = bench.probe.create_publisher(Imu, 'imu', ros.BEST_EFFORT)
-        wait_for(lambda: self.publisher.get_subscription_count() == 1, 'subscription of imu')
+        def say(matrix, stamp, frame='tilted_lidar', covariance=0.01):
+            n_before = len(b.node._frames._imu._messages)
+            message = Imu(orientation=quaternion(matrix))
+            message.header.stamp.sec, message.header.stamp.nanosec = stamp
+            message.header.frame_id = frame
+            message.orientation_covariance[0] = covariance
+            publisher.publish(message)
+            wait_for(lambda: len(b.node._frames._imu._messages) > n_before, 'orientation')
 
-    def cloud(self, seconds, nanosec=10_000_000):
-        return to_message(self.points, stamp=(seconds, nanosec), frame='tilted_lidar')
-
-    def say(self, matrix, stamp, frame='tilted_lidar', covariance=0.01):
-        n_before = len(self.bench.node._frames._imu._messages)
-        message = Imu(orientation=quaternion(matrix))
-        message.header.stamp.sec, message.header.stamp.nanosec = stamp
-        message.header.frame_id = frame
-        message.orientation_covariance[0] = covariance
-        self.publisher.publish(message)
-        wait_for(lambda: len(self.bench.node._frames._imu._messages) > n_before, 'orientation')
-
-    def check_refused(self, reason, seconds, nanosec=10_000_000):
-        self.bench.publisher.publish(self.cloud(seconds, nanosec))
-        self.bench.wait_for_status('input', lambda _, s: reason in s.message)
-
-
-BY_IMU = {**VALUES, 'frame.level': 'imu', 'diagnostics.period': 0.1}
+        yield b, say
 
 
 def test_tilt_by_an_imu(monkeypatch):
     points, turn = turned_street()
-    with bench(*ros.given(BY_IMU)) as b:
-        imu = ImuProbe(b, points)
-        imu.check_refused(f'no message on {ros.NAMESPACE}/imu, for frame.level = imu', 2)
+    with bench_with_imu() as (b, say):
+
+        def check_refused(reason, seconds, nanosec=0):
+            b.publisher.publish(cloud_of(points, seconds, nanosec))
+            b.wait_for_status('input', lambda _, s: reason in s.message)
+
+        check_refused(f'no message on {ros.NAMESPACE}/imu, for frame.level = imu', 2)
         # A cloud waits for the first orientation that is newer; the nearest in time holds.
         monkeypatch.setattr(transforms, 'MAX_WAIT', 60.0)
-        b.publisher.publish(imu.cloud(3))
+        message = cloud_of(points, 3, 10_000_000)
+        b.publisher.publish(message)
         wait_for(lambda: len(b.node._frames._waiting) == 1, 'cloud that waits')
-        imu.say(np.eye(3), (3, 0))
+        say(np.eye(3), (3, 0))
         time.sleep(5 * transforms.REVIEW_PERIOD)
         assert len(b.node._frames._waiting) == 1
         for nanosec, matrix in ((9_000_000, turn), (12_000_000, np.eye(3))):
-            imu.say(matrix, (3, nanosec))
-        check_levelled(points, imu.cloud(3), (b.ground.wait(1)[0], b.obstacles.wait(1)[0]))
+            say(matrix, (3, nanosec))
+        check_levelled(points, message, (b.ground.wait(1)[0], b.obstacles.wait(1)[0]))
         # Refused: far from it in time, without an orientation, in a frame that is not known.
         monkeypatch.setattr(transforms, 'MAX_WAIT', 0.1)
-        imu.check_refused('is 0.058 s from its stamp: must be within 0.05 s', 3, 70_000_000)
-        imu.say(turn, (5, 10_000_000), covariance=-1.0)
-        imu.check_refused('orientation_covariance[0] is -1', 5)
-        imu.say(turn, (6, 10_000_000), frame='imu_link')
+        check_refused('is 0.058 s from its stamp: must be within 0.05 s', 3, 70_000_000)
+        say(turn, (5, 0), covariance=-1.0)
+        check_refused('orientation_covariance[0] is -1', 5)
+        say(turn, (6, 0), frame='imu_link')
         unknown = 'to that of /test_' if HAS_TF2 else 'needs tf2_ros (sudo apt install'
-        imu.check_refused(unknown, 6)
+        check_refused(unknown, 6)
         assert len(b.ground.messages) == 1
-        assert b.set('frame.level', 'sensor').successful
-        wait_for(lambda: imu.publisher.get_subscription_count() == 0, 'end of the subscription')
-        assert len(b.segment(imu.cloud(7))) == 2
+        assert not b.set('frame.level', 'sensor')
+        wait_for(lambda: not b.probe.count_subscribers('imu'), 'end of the subscription')
+        assert len(b.segment(cloud_of(points, 7))) == 2
 
 
-@pytest.mark.usefixtures('stand_in')
-def test_tilt_by_an_imu_in_another_frame():
+def test_tilt_by_an_imu_in_another_frame(tf):
     points, turn = turned_street()
-    mount = rotation(-1.2, 0.7)
-    StandInBuffer.known['imu_link', 'tilted_lidar'] = quaternion(mount)
-    with bench(*ros.given(BY_IMU)) as b:
-        imu = ImuProbe(b, points)
-        imu.say(turn @ mount.T, (3, 20_000_000), 'imu_link')
-        check_levelled(points, imu.cloud(3), b.segment(imu.cloud(3)))
+    tf.known['imu_link', 'tilted_lidar'] = mount = rotation(-1.2, 0.7)
+    message = cloud_of(points, 3)
+    with bench_with_imu() as (b, say):
+        say(turn @ mount.T, (3, 20_000_000), 'imu_link')
+        check_levelled(points, message, b.segment(message))
 
 
 @pytest.mark.skipif(not HAS_TF2, reason='tf2_ros is not installed (it has no wheel)')
@@ -301,8 +277,8 @@ def test_tilt_by_real_tf():
     from tf2_ros import StaticTransformBroadcaster
 
     points, turn = turned_street()
-    message = to_message(points, stamp=(3, 4), frame='tilted_lidar')
-    with bench(*ros.given({**VALUES, 'frame.level': 'tf'})) as b:
+    message = cloud_of(points, 3)
+    with bench({**VALUES, 'frame.level': 'tf'}) as b:
         broadcaster = StaticTransformBroadcaster(b.probe)
         known = TransformStamped(child_frame_id='tilted_lidar')
         known.header.frame_id = 'base_link'

@@ -1,6 +1,5 @@
 """The managed node, driven by the services that ``ros2 lifecycle`` and Nav2's manager call."""
 
-import contextlib
 import importlib.util
 import signal
 import time
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 import ros_helpers as ros
 from cli_runner import children
-from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from ros_helpers import street, to_message, wait_for
 
@@ -20,133 +19,113 @@ from gp_ground_seg.ros.loader import FOLLOWS
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
-START = (
-    '-c', 'import sys; from gp_ground_seg.cli.node import main_managed; sys.exit(main_managed())',
-)  # fmt: skip
-OFTEN = '-p', 'diagnostics.period:=0.1', '-p', 'diagnostics.stale_after:=0.5'
+UNCONFIGURED, INACTIVE, ACTIVE, FINALIZED = 1, 2, 3, 4
+CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE, SHUTDOWN = 1, 2, 3, 4, 5
+"""Numbers of `lifecycle_msgs`: states, and transitions; 5 to 7 end each of the first states."""
 
 
-@contextlib.contextmanager
-def managed_node(folder, **environment):
-    """The process of a node, and a `Link` to it, which is not subscribed to yet."""
-    words = *ros.IN_NAMESPACE, *OFTEN
-    with (
-        ros.Process(*words, folder=folder, start=START, **environment) as process,
-        ros.isolated_context() as context,
+@pytest.fixture
+def managed(tmp_path):
+    """The process of a node, and a `Link` to it; it ends without an error."""
+    limits = {'diagnostics.stale_after': 0.5}
+    with ros.linked_process(tmp_path, limits, connected=False, start=ros.MANAGED) as (
+        process,
+        link,
     ):
-        process.wait_until_ready('not listening to')
-        link = ros.Link(context)
-        with ros.spinning(context, link.probe):
-            yield process, link
+        yield process, link
+        process.end_well()
 
 
-def change(link, transition):
+def change(link, number=0, label=''):
     """Whether the node has made the transition, and its state after it."""
-    request = ChangeState.Request(transition=Transition(id=transition))
+    request = ChangeState.Request(transition=Transition(id=number, label=label))
     is_done = link.call(ChangeState, 'change_state', request).success
     return is_done, link.call(GetState, 'get_state', GetState.Request()).current_state.id
 
 
-def wait_for_subscriptions(link, n):
-    wait_for(lambda: link.publisher.get_subscription_count() == n, f'{n} subscriptions')
-
-
-def test_the_transitions_compile_listen_and_free(tmp_path):
+def test_the_transitions_compile_listen_and_free(managed):
+    process, link = managed
     message = to_message(street(3000))
-    with managed_node(tmp_path) as (process, link):
-        status = link.wait_for_status('input', lambda v, _: v['Publishers'] == '1')
-        assert 'not listening to' in status.message and status.level == b'\0'
-        assert link.set('label.ground_tolerance', 0.12).successful
-        assert FOLLOWS not in process.log
-        for numbers in (('1', '2'), ('3',)):
-            configured = change(link, Transition.TRANSITION_CONFIGURE)
-            assert configured == (True, State.PRIMARY_STATE_INACTIVE)
-            for n in numbers:
-                wait_for_subscriptions(link, 0)
-                active = change(link, Transition.TRANSITION_ACTIVATE)
-                assert active == (True, State.PRIMARY_STATE_ACTIVE)
-                link.wait_until_connected()
-                assert sum(cloud.width for cloud in link.segment(message)) == 3000
-                status = link.wait_for_status(
-                    'processing', lambda v, _, n=n: v['Clouds since startup'] == n
-                )
-                # The first cloud, too.
-                assert ros.values_of(status)['Backend'] == choose_backend('auto')
-                stopped = change(link, Transition.TRANSITION_DEACTIVATE)
-                assert stopped == (True, State.PRIMARY_STATE_INACTIVE)
-            clean = change(link, Transition.TRANSITION_CLEANUP)
-            assert clean == (True, State.PRIMARY_STATE_UNCONFIGURED)
-        end = change(link, Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
-        assert end == (True, State.PRIMARY_STATE_FINALIZED)
-        assert process.stop(signal.SIGINT)[0] == 0
-        assert 'Traceback' not in process.log and 'ERROR' not in process.log
+    status = link.wait_for_status('input', lambda v, _: v['Publishers'] == '1')
+    assert 'not listening to' in status.message and status.level == b'\0'
+    assert not link.set('label.ground_tolerance', 0.12)
+    assert FOLLOWS not in process.log
+    for numbers in (('1', '2'), ('3',)):
+        assert change(link, CONFIGURE) == (True, INACTIVE)
+        for n in numbers:
+            wait_for(lambda: not link.publisher.get_subscription_count(), 'no subscription')
+            assert change(link, ACTIVATE) == (True, ACTIVE)
+            link.wait_until_connected()
+            assert sum(cloud.width for cloud in link.segment(message)) == 3000
+            status = link.wait_for_status(
+                'processing', lambda v, _, n=n: v['Clouds since startup'] == n
+            )
+            # The first cloud, too.
+            assert ros.values_of(status)['Backend'] == choose_backend('auto')
+            assert change(link, DEACTIVATE) == (True, INACTIVE)
+        assert change(link, CLEANUP) == (True, UNCONFIGURED)
+    assert change(link, SHUTDOWN) == (True, FINALIZED)
 
 
-def test_a_lifecycle_manager_hears_a_bond_while_the_node_is_active(tmp_path):
+def test_a_lifecycle_manager_hears_a_bond_while_the_node_is_active(managed):
     status = pytest.importorskip('bond.msg', reason='package bond is not installed').Status
-    with managed_node(tmp_path) as (process, link):
-        heard, instances = ros.Collector(link.probe, status, 'bond'), []
-        change(link, Transition.TRANSITION_CONFIGURE)
-        assert not heard.messages
-        for n in (1, 2):
-            heard.messages.clear()
-            change(link, Transition.TRANSITION_ACTIVATE)
-            wait_for(lambda: len(heard.messages) > 2, 'three heartbeats')
-            change(link, Transition.TRANSITION_DEACTIVATE)
-            wait_for(lambda: not heard.messages[-1].active, 'end of the bond')
-            *beats, end = heard.messages
-            assert all(beat.active for beat in beats), n
-            assert {one.id for one in heard.messages} == {NODE_NAME}
-            instances.append({one.instance_id for one in heard.messages})
-            times = [one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec for one in beats]
-            # Nav2's manager waits half of its bond_timeout for the first that it hears.
-            assert np.median(np.diff(times)) == pytest.approx(0.1, abs=0.05)
-            assert end.heartbeat_period == pytest.approx(0.1) and end.heartbeat_timeout == 4.0
-        (first,), (second,) = instances
-        assert first != second
-        assert process.stop(signal.SIGINT)[0] == 0
-        assert 'Traceback' not in process.log and 'bond_timeout' not in process.log
+    process, link = managed
+    heard, instances = ros.Collector(link.probe, status, 'bond'), set()
+    change(link, CONFIGURE)
+    assert not heard.messages
+    for n in (1, 2):
+        heard.messages.clear()
+        change(link, ACTIVATE)
+        wait_for(lambda: len(heard.messages) > 2, 'three heartbeats')
+        change(link, DEACTIVATE)
+        wait_for(lambda: not heard.messages[-1].active, 'end of the bond')
+        *beats, end = heard.messages
+        assert all(beat.active for beat in beats)
+        assert {one.id for one in heard.messages} == {NODE_NAME}
+        instances |= {one.instance_id for one in heard.messages}
+        assert len(instances) == n
+        times = [one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec for one in beats]
+        # Nav2's manager waits half of its bond_timeout for the first that it hears.
+        assert np.median(np.diff(times)) == pytest.approx(0.1, abs=0.05)
+        assert end.heartbeat_period == pytest.approx(0.1) and end.heartbeat_timeout == 4.0
+    assert 'bond_timeout' not in process.log
 
 
-def test_impossible_transitions_are_refused_at_once(tmp_path):
-    unconfigured, inactive = State.PRIMARY_STATE_UNCONFIGURED, State.PRIMARY_STATE_INACTIVE
-    active, finalized = State.PRIMARY_STATE_ACTIVE, State.PRIMARY_STATE_FINALIZED
+def test_impossible_transitions_are_refused_at_once(managed):
+    process, link = managed
     # What is possible in a state, the transition that the test takes first.
-    possible = {unconfigured: (1, 5), inactive: (3, 2, 6), active: (7, 4), finalized: ()}
-    with managed_node(tmp_path) as (process, link):
-        for state, numbers in possible.items():
-            for number in {*range(12), *range(60, 70), 99, 255}.difference(numbers):
-                start = time.monotonic()
-                assert change(link, number) == (False, state), (state, number)
-                assert time.monotonic() - start < 5.0
-            for label in ('create', 'activate', 'nonsense\n'):
-                if (state, label) != (inactive, 'activate'):
-                    request = ChangeState.Request(transition=Transition(label=label))
-                    assert not link.call(ChangeState, 'change_state', request).success
-            if state == active:
-                link.wait_until_connected()
-                assert sum(cloud.width for cloud in link.segment(to_message(street(500)))) == 500
-            assert state == finalized or change(link, numbers[0])[0]
-        is_said = 'set bond_timeout: 0.0' in process.log
-        assert is_said == (importlib.util.find_spec('bond') is None)
-        refused = [line for line in process.log.splitlines() if ' refused: ' in line]
-        assert refused and '[WARN]' in refused[0]
-        assert 'refused: it is not possible in the present state' in refused[0]
-        assert process.stop(signal.SIGINT)[0] == 0
-        assert 'Traceback' not in process.log and 'ERROR' not in process.log
+    possible = {
+        UNCONFIGURED: (CONFIGURE, SHUTDOWN), INACTIVE: (ACTIVATE, CLEANUP, 6),
+        ACTIVE: (7, DEACTIVATE), FINALIZED: (),
+    }  # fmt: skip
+    for state, numbers in possible.items():
+        for number in {*range(12), *range(60, 70), 99, 255}.difference(numbers):
+            start = time.monotonic()
+            assert change(link, number) == (False, state), (state, number)
+            assert time.monotonic() - start < 5.0
+        for label in ('create', 'activate', 'nonsense\n'):
+            assert (state, label) == (INACTIVE, 'activate') or not change(link, label=label)[0]
+        if state == ACTIVE:
+            link.wait_until_connected()
+            assert sum(cloud.width for cloud in link.segment(to_message(street(500)))) == 500
+        assert state == FINALIZED or change(link, numbers[0])[0]
+    is_said = 'set bond_timeout: 0.0' in process.log
+    assert is_said == (importlib.util.find_spec('bond') is None)
+    refused = [line for line in process.log.splitlines() if ' refused: ' in line]
+    assert refused and '[WARN]' in refused[0]
+    assert 'refused: it is not possible in the present state' in refused[0]
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
-def test_a_signal_ends_the_wait_for_compiled_code(tmp_path):
+def test_a_signal_ends_the_wait_for_compiled_code(tmp_path, monkeypatch, request):
     cache = tmp_path / 'cache'
     cache.mkdir(mode=0o700)
-    with managed_node(tmp_path, NUMBA_CACHE_DIR=str(cache)) as (process, link):
-        client = link.probe.create_client(ChangeState, f'{link.node_name}/change_state')
-        wait_for(client.service_is_ready, 'service')
-        client.call_async(
-            ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
-        )
-        wait_for(lambda: children(process.popen.pid), 'compiler')
-        code, seconds = process.stop(signal.SIGTERM)
-        assert code == 0 and seconds < 10.0
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(cache))
+    process, link = request.getfixturevalue('managed')
+    client = link.probe.create_client(ChangeState, f'{link.node_name}/change_state')
+    wait_for(client.service_is_ready, 'service')
+    configure = Transition(id=CONFIGURE)
+    client.call_async(ChangeState.Request(transition=configure))
+    wait_for(lambda: children(process.popen.pid), 'compiler')
+    process.end_well(signal.SIGTERM)

@@ -15,11 +15,10 @@ from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.ros.arguments import unused_files
+from gp_ground_seg.ros.node import main
 from gp_ground_seg.ros.session import ROS_WHEELS, ros_session, stop_on_signals
 
-FIXED = (*IN_NAMESPACE, '-p', 'learning.mode:=fixed')
-SOON = 4.0
-"""Time of the cloud at hand, and what a machine that does other things adds to it [s]."""
+FIXED = (*IN_NAMESPACE, *ros.given({'learning.mode': 'fixed'}))
 QOS = 'qos_overrides./points.subscription'
 HEAD = '/**:\n  ros__parameters:\n'
 
@@ -61,29 +60,30 @@ WORDS = {
 if importlib.util.find_spec('tf2_ros') is None:
     WORDS['-p frame.level:=tf'] = (
         'frame.level = tf: needs tf2_ros, which cannot be imported: sudo apt install '
-        'ros-jazzy-tf2-ros-py, or use frame.level = sensor with sensor.roll'
+        'ros-jazzy-tf2-ros-py'
     )
 
 
-@pytest.mark.parametrize('text', FILES)
-def test_bad_file(tmp_path, capfd, text):
-    path = tmp_path / 'b\x1b[2Ja\nd.yaml'
-    path.write_bytes(text.encode('latin-1'))
-    line = ros.start_error(capfd, '--params-file', str(path))
-    assert FILES[text] in line and line.isprintable()
-
-
-@pytest.mark.parametrize('words', WORDS)
-def test_bad_words(monkeypatch, capfd, words):
-    if words.startswith('ROS_'):
-        monkeypatch.setenv(*words.split('='))
-    line = ros.start_error(capfd, *[word for word in words.split() if word[:4] != 'ROS_'])
-    assert WORDS[words] in line and '.c:' not in line
+@pytest.mark.parametrize('given', [*FILES, *WORDS])
+def test_what_is_refused_is_said_in_one_line(tmp_path, monkeypatch, capfd, given):
+    if given.startswith('ROS_'):
+        monkeypatch.setenv(*given.split('='))
+    words = [word for word in given.split() if word[:4] != 'ROS_']
+    if given in FILES:
+        path = tmp_path / 'b\x1b[2Ja\nd.yaml'
+        path.write_bytes(given.encode('latin-1'))
+        words = ['--params-file', str(path)]
+    assert main(['--ros-args', *words]) == 2
+    said = capfd.readouterr()
+    line = said.err.splitlines()[-1]
+    assert said.out == '' and 'Traceback' not in said.err
+    assert line.startswith('ground_segmentation_node: error: ')
+    assert {**FILES, **WORDS}[given] in line and line.isprintable() and '.c:' not in line
 
 
 @pytest.mark.parametrize('words', ['node nonsense', 'node --ros-args -- nonsense'])
 def test_words_that_nobody_takes_are_refused(capsys, words):
-    with ros.isolated(), pytest.raises(SystemExit, match='2'):
+    with pytest.raises(SystemExit, match='2'):
         sys.exit(cli_runner.run(*words.split()))
     assert 'nonsense' in capsys.readouterr().err
 
@@ -116,29 +116,27 @@ def test_missing_ros_is_said_in_one_line(tmp_path, command):
 
 
 NAME = f'{NAMESPACE}/front/filter'
+P = '{ros__parameters: {label: {ground_tolerance: 0.3}}}'
 USED = (
-    '/**:\n  P', '"**":\n  P', f'{NAME}:\n  P', f'{NAME[1:]}:\n  P',
-    f'{NAMESPACE}:\n  front:\n    filter:\n      P', f'{NAMESPACE}/front:\n  filter:\n    P',
-    '/**/filter:\n  P', '/**:\n  filter:\n    P', '/*/*/filter:\n  P',
-    '/*/front:\n  filter:\n    P', f'{NAMESPACE}/**:\n  P', '/*/*/*:\n  P', f'{NAME}/**:\n  P',
-    f'other:\n  P\n{NAME}:\n  P',
+    '/**', '"**"', NAME, NAME[1:], f'{NAMESPACE}:\n  front:\n    filter',
+    f'{NAMESPACE}/front:\n  filter', '/**/filter', '/**:\n  filter', '/*/*/filter',
+    '/*/front:\n  filter', f'{NAMESPACE}/**', '/*/*/*', f'{NAME}/**', f'other: {P}\n{NAME}',
 )  # fmt: skip
 UNUSED = (
-    'patchworkpp_node:\n  P', 'ground_segmentation_node:\n  P', 'filter:\n  P',
-    f'{NAMESPACE}/filter:\n  P', f'{NAMESPACE}/front:\n  other:\n    P', '/**/front:\n  P',
-    f'{NAMESPACE}/*:\n  P', '"*/filter":\n  P', '/*:\n  P',
+    'patchworkpp_node', 'ground_segmentation_node', 'filter', f'{NAMESPACE}/filter',
+    f'{NAMESPACE}/front:\n  other', '/**/front', f'{NAMESPACE}/*', '"*/filter"', '/*',
 )  # fmt: skip
-"""Files, with P for parameters; in them the node has another name, or another namespace."""
+"""Keys of parameters; in them the node has another name, or another namespace."""
 
 
-@pytest.mark.parametrize('text', [*USED, *UNUSED])
-def test_a_file_is_unused_where_rcl_takes_nothing_of_it(tmp_path, text):
+@pytest.mark.parametrize('keys', [*USED, *UNUSED])
+def test_a_file_is_unused_where_rcl_takes_nothing_of_it(tmp_path, keys):
     path = tmp_path / 'keys.yaml'
-    path.write_text(text.replace('P', 'ros__parameters: {label: {ground_tolerance: 0.3}}'))
+    path.write_text(f'{keys}: {P}\n')
     words = '-r', f'__ns:={NAMESPACE}/front', '-r', '__node:=filter', '--params-file', str(path)
     with ros.started_node(*words) as node:
-        assert (node.config.label.ground_tolerance == 0.3) == (text in USED)
-        assert len(unused_files(words, node.get_fully_qualified_name())) == (text in UNUSED)
+        assert (node.config.label.ground_tolerance == 0.3) == (keys in USED)
+        assert len(unused_files(words, node.get_fully_qualified_name())) == (keys in UNUSED)
 
 
 def test_unused_files_are_warned_of_with_their_keys(tmp_path):
@@ -147,14 +145,12 @@ def test_unused_files_are_warned_of_with_their_keys(tmp_path):
         path = tmp_path / f'{name}.yaml'
         path.write_text(''.join(f'{key}:\n  ros__parameters: {{}}\n' for key in keys))
         words += ['--params-file', str(path)]
-    (first,) = unused_files([*words, '--params-file', 'gone.yaml'], '/front/filter')
-    assert first.startswith(rf'{tmp_path}/a\x1b[2J.yaml: not used: ')
-    assert 'those of b, /c/d, and this node is /front/filter' in first
-    words = *FIXED, '-p', 'runtime.backend:=numpy', *words[:2]
-    with Process(*words, folder=tmp_path) as node:
+    with Process(*FIXED, *words, folder=tmp_path) as node:
         node.wait_until_ready('not used')
         (line,) = [line for line in node.log.splitlines() if 'WARN' in line]
-        assert f'those of b, /c/d, and this node is {NAMESPACE}/ground_segmentation_node' in line
+    assert rf'{tmp_path}/a\x1b[2J.yaml: not used: ' in line
+    assert f'those of b, /c/d, and this node is {NAMESPACE}/ground_segmentation_node' in line
+    assert unused_files(['--params-file', 'gone.yaml'], '/front/filter') == []
 
 
 # Signals to the node: it ends with code 0, after the cloud at hand.
@@ -172,20 +168,13 @@ def heeds_sigterm(process):
     return bool(int(caught.split()[1], 16) >> (signal.SIGTERM - 1) & 1)
 
 
-def assert_good_end(node, number):
-    code, duration = node.stop(number)
-    assert code == 0, node.log
-    assert duration < SOON
-    assert 'Traceback' not in node.log and 'ERROR' not in node.log
-
-
 @pytest.mark.parametrize(
     ('start', 'number'), [(ros.ENTRY_POINT, signal.SIGINT), (MODULE, signal.SIGTERM)]
 )
 def test_while_importing(tmp_path, start, number):
     with Process(*FIXED, folder=tmp_path, start=start) as node:
         wait_for(lambda: heeds_sigterm(node), 'handler')
-        assert_good_end(node, number)
+        node.end_well(number)
         assert 'listening' not in node.log
 
 
@@ -212,10 +201,10 @@ def test_while_compiling(tmp_path, mode, number):
             node.wait_until_ready('others can write')
         before = cpu_seconds(worker)
         wait_for(lambda: cpu_seconds(worker) > before + 2.0, 'work')
-        if number == signal.SIGTERM:
-            assert_good_end(node, number)
+        if number == signal.SIGKILL:
+            node.popen.kill()
         else:
-            node.stop(number)
+            node.end_well(number)
     wait_for(lambda: not is_running(worker), 'end of the compiler')
 
 
@@ -223,14 +212,14 @@ def test_under_load(tmp_path):
     """The cloud at hand is the last one; signals that follow do not break the end."""
     message = ros.to_message(ros.street(20_000))
     slow = {'runtime.backend': 'numpy', 'grid.n_segments': 360, 'learning.segment_step': 1}
-    with ros.linked_process(tmp_path, *ros.given(slow)) as (node, link):
+    with ros.linked_process(tmp_path, slow) as (node, link):
         for _ in range(6):
             link.publisher.publish(message)
         link.ground.wait(1)
         # A terminal and a launch file both send one.
         for _ in range(2):
             node.popen.send_signal(signal.SIGINT)
-        assert_good_end(node, signal.SIGTERM)
+        node.end_well(signal.SIGTERM)
         assert len(link.ground.messages) < 6
 
 
@@ -250,7 +239,7 @@ def test_sigint_that_was_ignored_at_the_start_ends_the_player_and_the_node(tmp_p
             link.ground.wait(4)
             assert player.stop(signal.SIGINT)[0] == 130
             assert player.log.splitlines()[-1] == 'gp-ground-seg: interrupted'
-        assert_good_end(node, signal.SIGINT)
+        node.end_well(signal.SIGINT)
 
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -258,10 +247,9 @@ STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @pytest.fixture
 def handlers(heeded_hangup):
-    """The handlers in use, which are there again after the test; other nodes are not heard."""
+    """The handlers in use, which are there again after the test."""
     before = {number: signal.getsignal(number) for number in STOPS}
-    with ros.isolated():
-        yield before
+    yield before
     for number, handler in before.items():
         signal.signal(number, handler)
 
@@ -273,23 +261,28 @@ def test_without_a_signal_all_is_as_before_and_an_error_is_an_error(handlers):
     assert {number: signal.getsignal(number) for number in STOPS} == handlers
 
 
-def wait_for_signal(number, wait, *seconds):
+WAITS = {
+    'sleep': lambda session: session.sleep(0.001),
+    'spin': lambda session: session.spin(0.001),
+    'check': lambda session: session.check(),
+    'the end of the block': lambda _session: None,
+}
+
+
+def wait_for_signal(wait, number):
     with ros_session('any') as session:
         for _ in range(2):
             os.kill(os.getpid(), number)  # the second changes nothing
-        if wait:
-            getattr(session, wait)(*seconds)
-            pytest.fail('not interrupted')
+        WAITS[wait](session)
+        assert wait == 'the end of the block'
 
 
 @pytest.mark.parametrize('number', STOPS)
-@pytest.mark.parametrize('wait', ['sleep 0.001', 'spin 0.001', 'check', ''])
+@pytest.mark.parametrize('wait', WAITS)
 @pytest.mark.usefixtures('handlers')
 def test_a_signal_interrupts_the_next_wait(wait, number):
-    """Also the end of the block."""
-    name, *seconds = wait.split(' ')
     with pytest.raises(KeyboardInterrupt):
-        wait_for_signal(number, name, *map(float, seconds))
+        wait_for_signal(wait, number)
 
 
 @pytest.mark.usefixtures('handlers')

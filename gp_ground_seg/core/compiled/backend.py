@@ -33,7 +33,7 @@ from gp_ground_seg.core.gp.latent import given_log_length_scales
 from gp_ground_seg.core.gp.learning import Learned, given_theta, theta_space
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.parameters.number_tuples import numbers_of
+from gp_ground_seg.core.parameters.schema import numbers_of
 from gp_ground_seg.core.pipeline.labels import depth_of_ground, lowest_of, sum_units
 from gp_ground_seg.core.pipeline.lines import find_lines, trace
 from gp_ground_seg.core.pipeline.points import in_columns

@@ -18,6 +18,7 @@ from gp_ground_seg.core.parameters.schema import (
     AUTO,
     NO_BOX,
     YAML_SUFFIXES,
+    ParameterGroup,
     ParameterGroups,
     ParameterSpec,
     ParameterValue,
@@ -38,7 +39,7 @@ ANY_HEIGHT = 100.0
 
 
 @dataclass(frozen=True)
-class SensorConfig:
+class SensorConfig(ParameterGroup):
     """Pose of the sensor; auto = estimated from every scan (docs/pose.md)."""
 
     height: float | Literal['auto'] = basic(AUTO, SENSOR_HEIGHTS,
@@ -56,7 +57,7 @@ class SensorConfig:
 
 
 @dataclass(frozen=True)
-class FrameConfig:
+class FrameConfig(ParameterGroup):
     """Source of the tilt and the position of the sensor; the node only."""
 
     level: str = basic('sensor', ('sensor', 'tf', 'imu'),
@@ -69,7 +70,7 @@ class FrameConfig:
 
 
 @dataclass(frozen=True)
-class InputConfig:
+class InputConfig(ParameterGroup):
     """What is taken of the input."""
 
     crop_box: tuple[float, ...] | Literal['none'] = basic(NO_BOX, (-100.0, 100.0),
@@ -81,7 +82,7 @@ class InputConfig:
 
 
 @dataclass(frozen=True)
-class OutputConfig:
+class OutputConfig(ParameterGroup):
     """The clouds ground and obstacles, scan and occupancy; the node only."""
 
     min_height: float = advanced(-ANY_HEIGHT, (-ANY_HEIGHT, ANY_HEIGHT),
@@ -96,7 +97,7 @@ class OutputConfig:
 
 
 @dataclass(frozen=True)
-class GridConfig:
+class GridConfig(ParameterGroup):
     """Radial grid map."""
 
     n_segments: int = basic(180, (4, 2048), 'angular segments of the radial grid', symbol='M')
@@ -110,7 +111,7 @@ class GridConfig:
 
 
 @dataclass(frozen=True)
-class LinesConfig:
+class LinesConfig(ParameterGroup):
     """Line extraction over the ground candidates of a segment."""
 
     slope_tolerance: float = advanced(0.1, (0.001, 1.0),
@@ -133,7 +134,7 @@ class LinesConfig:
 
 
 @dataclass(frozen=True)
-class LengthScaleConfig:
+class LengthScaleConfig(ParameterGroup):
     """Length-scale of the observation process along a segment."""
 
     model: str = advanced('latent', ('latent', 'line_gradient', 'constant'),
@@ -148,7 +149,7 @@ class LengthScaleConfig:
 
 
 @dataclass(frozen=True)
-class ObservationConfig:
+class ObservationConfig(ParameterGroup):
     """Hyper-parameters of the observation process GP_z."""
 
     sigma_f: float = advanced(0.3, (0.001, 10.0),
@@ -160,7 +161,7 @@ class ObservationConfig:
 
 
 @dataclass(frozen=True)
-class LatentConfig:
+class LatentConfig(ParameterGroup):
     """Latent process GP_l over log length-scale, and its pseudo-inputs."""
 
     sigma_f_bar: float = advanced(0.9, (0.01, 100.0),
@@ -174,7 +175,7 @@ class LatentConfig:
 
 
 @dataclass(frozen=True)
-class GrowthConfig:
+class GrowthConfig(ParameterGroup):
     """Iterative growth of the inlier set (outlier rejection)."""
 
     seed_range: float = advanced(20.0, (0.5, 200.0),
@@ -198,7 +199,7 @@ class GrowthConfig:
 
 
 @dataclass(frozen=True)
-class SurfaceConfig:
+class SurfaceConfig(ParameterGroup):
     """From the segments' surfaces to the surface of the frame."""
 
     look_aside: bool = advanced(True, (),
@@ -207,7 +208,7 @@ class SurfaceConfig:
 
 
 @dataclass(frozen=True)
-class FacesConfig:
+class FacesConfig(ParameterGroup):
     """Vertical faces, whose bases lie within the tolerance of ground."""
 
     cell_size: float = advanced(0.5, (0.05, 10.0),
@@ -220,7 +221,7 @@ class FacesConfig:
 
 
 @dataclass(frozen=True)
-class LabelConfig:
+class LabelConfig(ParameterGroup):
     """Labels from the distance to the surface."""
 
     rule: str = advanced('roughness', ('roughness', 'tolerance'),
@@ -240,7 +241,7 @@ class LabelConfig:
 
 
 @dataclass(frozen=True)
-class LearningConfig:
+class LearningConfig(ParameterGroup):
     """Learning of the hyper-parameters."""
 
     mode: str = basic('every_frame', ('every_frame', 'fixed'),
@@ -261,7 +262,7 @@ class LearningConfig:
 
 
 @dataclass(frozen=True)
-class RuntimeConfig:
+class RuntimeConfig(ParameterGroup):
     """How the work is done; nothing here changes a label."""
 
     backend: str = advanced('auto', ('auto', 'numba', 'numpy'),
@@ -269,7 +270,7 @@ class RuntimeConfig:
 
 
 @dataclass(frozen=True)
-class DiagnosticsConfig:
+class DiagnosticsConfig(ParameterGroup):
     """Diagnostics of the node on /diagnostics."""
 
     period: float = advanced(1.0, (0.1, 60.0), 'time between two diagnostics messages', 's')
@@ -321,24 +322,26 @@ class Config(ParameterGroups):
             low, high = float(self[lower]), float(self[upper])
             if not low < high:
                 raise ConfigError(f'{lower} = {low:g}: must be below {upper} = {high:g}')
-        _check_bins(self.grid)
-        _check_memory(self)
+        grid, size = self.grid, size_of_tables(self)
+        # Bins widen with range: the first one is the narrowest.
+        width = (grid.r_max - grid.r_min) / float(grid.n_bins) ** grid.bin_growth
+        if width < NARROWEST_BIN:
+            raise ConfigError(
+                f'grid.n_bins = {grid.n_bins}, grid.bin_growth = {grid.bin_growth:g} between '
+                f'grid.r_min = {grid.r_min:g} and grid.r_max = {grid.r_max:g}: the first bin '
+                f'would be {width:.2g} m wide; must be at least {NARROWEST_BIN:g} m'
+            )
+        if size > MAX_TABLES:
+            raise ConfigError(
+                f'grid.r_max = {grid.r_max:g}, faces.cell_size = {self.faces.cell_size:g}: '
+                f'tables of tiles and cells would take {size / 1e9:.1f} GB; must be at most '
+                f'{MAX_TABLES / 1e9:g} GB'
+            )
 
     @classmethod
     def preset(cls, name: str) -> Config:
         """Return the preset `name`, ``default`` or ``paper``; ConfigError for another."""
         return find_preset(name).config
-
-
-def _check_bins(grid: GridConfig) -> None:
-    # Bins widen with range: the first one is the narrowest.
-    width = (grid.r_max - grid.r_min) / float(grid.n_bins) ** grid.bin_growth
-    if width < NARROWEST_BIN:
-        raise ConfigError(
-            f'grid.n_bins = {grid.n_bins}, grid.bin_growth = {grid.bin_growth:g} between '
-            f'grid.r_min = {grid.r_min:g} and grid.r_max = {grid.r_max:g}: the first bin would be '
-            f'{width:.2g} m wide; must be at least {NARROWEST_BIN:g} m'
-        )
 
 
 def size_of_tables(config: Config) -> int:
@@ -347,16 +350,6 @@ def size_of_tables(config: Config) -> int:
     n_cells = config.grid.n_segments * config.grid.n_bins
     # Held against both backends by test_robustness.py.
     return 9 * n_tiles + 184 * n_cells
-
-
-def _check_memory(config: Config) -> None:
-    size = size_of_tables(config)
-    if size > MAX_TABLES:
-        raise ConfigError(
-            f'grid.r_max = {config.grid.r_max:g}, faces.cell_size = {config.faces.cell_size:g}: '
-            f'tables of tiles and cells would take {size / 1e9:.1f} GB; must be at most '
-            f'{MAX_TABLES / 1e9:g} GB'
-        )
 
 
 def parameter_specs() -> tuple[ParameterSpec, ...]:

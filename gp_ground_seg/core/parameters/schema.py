@@ -9,11 +9,11 @@ import functools
 import numbers
 import re
 import textwrap
-from collections import Counter
+from collections import Counter, namedtuple
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar, cast
 
 import yaml
 
@@ -53,8 +53,8 @@ class ParameterSpec:
     description: str
     unit: str  # SI; empty for a pure number
     symbol: str  # in the paper; empty if it has none
-    minimum: float | None  # inclusive, of a number and of those of a box; None for other types
-    maximum: float | None
+    minimum: Any  # inclusive, of a number and of those of a box; None for other types
+    maximum: Any
     choices: tuple[str, ...]  # accepted strings; empty for other types, and for any name
     auto: bool  # whether a number may also be `AUTO`
     basic: bool  # whether it is one of the few that are set for a robot
@@ -80,29 +80,31 @@ class ParameterSpec:
 
     def check(self, value: object) -> ParameterValue:
         """Return `value` in the declared type; ConfigError if it is of another or out of range."""
-        if self.auto and isinstance(value, str) and value == AUTO:
-            return AUTO
+        checked: ParameterValue | None = None
         if self.type is bool:
-            if isinstance(value, bool):
-                return value
+            checked = value if isinstance(value, bool) else None
+        elif self.auto and isinstance(value, str) and value == AUTO:
+            checked = AUTO
         elif self.type is str:
             # A name is letters, digits and ``_-./``.
             known = self.choices or re.findall(r'\A[\w\-./]+\Z', str(value), re.ASCII)
-            if isinstance(value, str) and value in known:
-                return value
-        elif self.type is tuple:
-            if (box := self._box(value)) is not None:
-                return box
-        elif isinstance(value, numbers.Real) and not isinstance(value, bool):
-            assert self.minimum is not None and self.maximum is not None
-            # The bounds are finite: NaN and the infinities are never within.
-            if value <= self.maximum and not value < self.minimum:
-                if self.type is float:
-                    return float(value)
-                if isinstance(value, numbers.Integral):
-                    return int(value)
-        given = repr(value) if len(repr(value)) <= 100 else f'{repr(value)[:100]} ...'
-        raise ConfigError(f'{self.name} = {given}: must be {self.accepted}')
+            checked = value if isinstance(value, str) and value in known else None
+        else:
+            checked = self._box(value) if self.type is tuple else self._number(value)
+        if checked is None:
+            given = repr(value) if len(repr(value)) <= 100 else f'{repr(value)[:100]} ...'
+            raise ConfigError(f'{self.name} = {given}: must be {self.accepted}')
+        return checked
+
+    def _number(self, value: Any) -> int | float | None:
+        """Return a number within the bounds in the declared type, else None."""
+        is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+        # The bounds are finite: NaN and the infinities are never within.
+        if not is_number or not self.minimum <= value <= self.maximum:
+            return None
+        if self.type is int:
+            return int(value) if isinstance(value, numbers.Integral) else None
+        return float(value)
 
     def _box(self, value: object) -> ParameterValue | None:
         """Return the six bounds, or `NO_BOX`, that `value` stands for; None if for neither."""
@@ -112,16 +114,12 @@ class ParameterSpec:
                 value = load_yaml(value)
         if isinstance(value, str):
             return NO_BOX if value == NO_BOX else None
-        bounds: list[Any] = list(value) if isinstance(value, Iterable) else [value]
-        if not bounds:
-            return NO_BOX
-        are_numbers = all(isinstance(b, numbers.Real) and not isinstance(b, bool) for b in bounds)
-        if len(bounds) != 6 or not are_numbers:
-            return None
-        assert self.minimum is not None and self.maximum is not None
-        pairs = zip(bounds[::2], bounds[1::2], strict=True)
-        is_box = all(self.minimum <= low < high <= self.maximum for low, high in pairs)
-        return tuple(map(float, bounds)) if is_box else None
+        given = list(value) if isinstance(value, Iterable) else [value]
+        bounds = [bound for bound in map(self._number, given) if bound is not None]
+        pairs = zip(bounds[::2], bounds[1::2], strict=False)
+        if len(bounds) == len(given) == 6 and all(low < high for low, high in pairs):
+            return tuple(bounds)
+        return None if given else NO_BOX
 
 
 def declare(
@@ -152,6 +150,32 @@ def declare(
 
 basic = functools.partial(declare, basic=True)
 advanced = functools.partial(declare, basic=False)
+
+
+class ParameterGroup:
+    """Base of a frozen dataclass of declared parameters, whose numbers compiled code reads."""
+
+    Numbers: ClassVar[Any]
+    """Named tuple of the numbers; words choose between kernels, which never see them."""
+
+    def __init_subclass__(cls) -> None:
+        """Derive the named tuple from the declaration."""
+        kinds = cls.__annotations__.items()
+        names = [name for name, kind in kinds if kind in ('bool', 'int', 'float')]
+        make: Any = namedtuple
+        numbers = make('Numbers', names, module=cls.__module__)
+        # numba pickles a type with the code it keeps, by this name.
+        numbers.__qualname__ = f'{cls.__qualname__}.Numbers'
+        cls.Numbers = numbers
+
+
+_Group = TypeVar('_Group')
+
+
+def numbers_of(group: _Group) -> _Group:
+    """Return the numbers of a group under the same names, for compiled code."""
+    kind = type(group).Numbers  # type: ignore[attr-defined]
+    return cast(_Group, kind(*(getattr(group, name) for name in kind._fields)))
 
 
 @dataclass(frozen=True)
@@ -189,9 +213,13 @@ class ParameterGroups:
 
     def _groups(self, values: Mapping[str, object]) -> dict[str, Any]:
         """Return groups with some values changed, by name."""
+        nested: dict[str, dict[str, Any]] = {}
+        for name, value in values.items():
+            group_name, field_name = name.split('.')
+            nested.setdefault(group_name, {})[field_name] = value
         return {
-            group_name: dataclasses.replace(getattr(self, group_name), **group)
-            for group_name, group in _nest(values).items()
+            name: dataclasses.replace(getattr(self, name), **group)
+            for name, group in nested.items()
         }
 
     def __getitem__(self, name: str) -> Any:
@@ -205,7 +233,7 @@ class ParameterGroups:
 
     def nested(self) -> dict[str, dict[str, ParameterValue]]:
         """Every value as ``{group: {field: value}}``."""
-        return _nest(self.flat())
+        return dataclasses.asdict(self)
 
     def replace(self, **changes: object) -> Self:
         """Copy with some values changed, given by dotted names (``**{'grid.r_max': 60.0}``).
@@ -242,16 +270,16 @@ class ParameterGroups:
         """
         problems = []
         try:
-            file = read_parameters(path)
-            for name, value in file.values.items():
+            values = read_parameters(path).values
+            for name, value in values.items():
                 try:
                     cls.find_spec(name).check(value)
                 except ConfigError as error:
                     problems.append(str(error))
             if not problems:
-                cls().replace(**file.values)
+                cls().replace(**values)
         except ConfigError as error:
-            return [str(error)]
+            problems.append(str(error))
         return problems
 
     def differences(self, other: Self) -> list[tuple[ParameterSpec, Any, Any]]:
@@ -311,24 +339,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f'; did you mean {near[0]}?' if near else ''
 
 
-def _nest(flat: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """``{'group.field': value}`` as ``{group: {field: value}}``."""
-    result: dict[str, dict[str, Any]] = {}
-    for name, value in flat.items():
-        group_name, field_name = name.split('.')
-        result.setdefault(group_name, {})[field_name] = value
-    return result
-
-
 class _Loader(yaml.SafeLoader):
     """PyYAML's safe loader, without some of its surprises (see `load_yaml`)."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """Refuse aliases, as ROS does: a kilobyte of them can stand for gigabytes."""
-        event = self.peek_event()  # type: ignore[no-untyped-call]
-        line = event.start_mark.line + 1
-        if isinstance(event, yaml.AliasEvent):
-            raise ConfigError(f'line {line}: aliases (*name) are not accepted')
+        if self.check_event(yaml.AliasEvent):
+            raise ConfigError(f'line {self.line + 1}: aliases (*name) are not accepted')
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
@@ -339,9 +356,8 @@ class _Loader(yaml.SafeLoader):
 
 
 def _refuse_repeated(names: Iterable[str], where: str = '') -> None:
-    for name, n_times in Counter(names).items():
-        if n_times > 1:
-            raise ConfigError(f'{name}: given twice{where}')
+    if twice := [name for name, n_times in Counter(names).items() if n_times > 1]:
+        raise ConfigError(f'{twice[0]}: given twice{where}')
 
 
 def _construct_int(loader: _Loader, node: yaml.ScalarNode) -> int:
@@ -350,13 +366,12 @@ def _construct_int(loader: _Loader, node: yaml.ScalarNode) -> int:
     return loader.construct_yaml_int(node)
 
 
-def _construct_list(loader: _Loader, node: yaml.SequenceNode) -> list[Any]:
-    """Read what launch_ros writes for a list, which rcl reads as one."""
-    return loader.construct_sequence(node)
-
-
 _Loader.add_constructor('tag:yaml.org,2002:int', _construct_int)
-_Loader.add_constructor('tag:yaml.org,2002:python/tuple', _construct_list)
+# What launch_ros writes for a list, which rcl reads as one.
+_Loader.add_constructor(
+    'tag:yaml.org,2002:python/tuple',
+    _Loader.construct_sequence,  # type: ignore[type-var]
+)
 _Loader.add_implicit_resolver(
     'tag:yaml.org,2002:float',
     re.compile(r'^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$'),
@@ -385,12 +400,11 @@ def load_yaml(text: str) -> object:
     Raises ConfigError if it is none, has aliases or a key twice, or cannot be of parameters.
     """
     try:
-        document: object = yaml.load(text, Loader=_Loader)
+        return yaml.load(text, Loader=_Loader)
     except ConfigError:
         raise
     except Exception as error:  # of many types: 2011-99-99, `!!int x`, `!!bool x`, ...
         raise ConfigError(f'not valid YAML: {in_one_line(error)}') from error
-    return document
 
 
 class ParameterFile(NamedTuple):

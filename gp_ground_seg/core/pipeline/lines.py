@@ -27,7 +27,7 @@ from gp_ground_seg.core.parameters.config import (
     LengthScaleConfig,
     LinesConfig,
 )
-from gp_ground_seg.core.parameters.number_tuples import numbers_of
+from gp_ground_seg.core.parameters.schema import numbers_of
 
 MIN_BREAK_CANDIDATES = 3
 """Candidates that a line after a slope break needs: through two there is always one."""
@@ -57,7 +57,7 @@ def find_lines(
     line, kind = np.empty((2, n), np.int64)
     pseudo = PseudoInputs(np.empty(n), np.empty(n), offsets, line, kind)
     continues_line = np.empty(n, np.bool_)
-    groups = tuple(
+    groups: Any = tuple(
         map(numbers_of, (config.lines, config.growth, config.latent, config.length_scale))
     )
     is_break = find_breaks(candidates.r, candidates.density, config.lines)

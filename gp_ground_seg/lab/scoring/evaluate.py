@@ -47,7 +47,7 @@ KEYS = ('method', 'sequence', 'index')
 COLUMNS: dict[str, tuple[str, ...]] = {
     'scans': KEYS,
     'rings': (*KEYS, 'range', *COUNTS),
-    'objects': (*KEYS, 'class', 'range', *OBJECT_COUNTS),
+    'objects': (*KEYS, 'class', *OBJECT_COUNTS),
 }
 """Columns that each frame has, even without rows."""
 
@@ -150,7 +150,6 @@ def score_methods(
     load: Callable[[Any], KnownScan] = load_kitti,
     *,
     each_alone: bool = False,
-    clock: Callable[[], float] = time.perf_counter,
     runner: Runner = HERE,
 ) -> Scores:
     """Run methods alternately on the same scans and score each run.
@@ -163,7 +162,7 @@ def score_methods(
     the same order, without being timed.
     """
     require_pandas()  # before any scan is read
-    score = partial(score_rows, load, methods, each_alone=each_alone, clock=clock)
+    score = partial(score_rows, load, methods, each_alone=each_alone)
     has_past = not each_alone and any(method.depends_on_past for method in methods)
     return make_scores(runner.run(score, items, attrgetter('sequence') if has_past else None))
 
@@ -175,7 +174,6 @@ def score_rows(
     progress: Progress = iter,
     *,
     each_alone: bool,
-    clock: Callable[[], float] = time.perf_counter,
 ) -> Rows:
     """Rows of some scans, by frame."""
     rows: Rows = {name: [] for name in COLUMNS}
@@ -193,9 +191,9 @@ def score_rows(
         for method in methods if k % 2 == 0 else reversed(methods):
             if forgets:
                 method.reset()
-            start = clock()
+            start = time.perf_counter()
             _run(method, scan)
-            seconds[method] = clock() - start
+            seconds[method] = time.perf_counter() - start
         results = [method.result() for method in methods]
         for method, other, result in zip(methods, copies, results, strict=True):
             own = _score(scan, result)
@@ -261,7 +259,7 @@ class Scores(NamedTuple):
     scans : sums of each scan: `COUNTS`, of `metrics.height_sums`, `OBJECT_COUNTS`, shares;
         seconds, those of the stages, pose, fit; what a method does not have is NaN
     rings : `COUNTS` of each ring of a scan
-    objects : `OBJECT_COUNTS` of each scan, by class and band
+    objects : `OBJECT_COUNTS` of each scan, by class
     """
 
     scans: DataFrame

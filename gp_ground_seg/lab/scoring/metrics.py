@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import IntArray, Label
 from gp_ground_seg.data.semantic_kitti import GROUND_CLASSES, OUTLIER, UNLABELLED, VEGETATION
 
@@ -24,17 +23,12 @@ COUNTS = ('tp', 'fp', 'fn', 'tn')
 """Points by true and given label, ground being positive."""
 
 
-def range_titles(edges: Sequence[float]) -> tuple[str, ...]:
-    """Names of the bands of range between edges [m], the last of which may be infinite."""
-    return tuple(
-        f'> {low:g} m' if math.isinf(high) else f'{low:g}-{high:g} m'
-        for low, high in itertools.pairwise(edges)
-    )
-
-
 RING_EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, math.inf)
 """Edges of the rings of horizontal range [m]; each holds its inner edge, not its outer one."""
-RING_TITLES = range_titles(RING_EDGES)
+RING_TITLES = (
+    *(f'{low:g}-{high:g} m' for low, high in itertools.pairwise(RING_EDGES[:-1])),
+    f'> {RING_EDGES[-2]:g} m',
+)
 
 
 def true_labels(semantic: npt.NDArray[np.integer]) -> Labels:
@@ -74,15 +68,13 @@ HEIGHT_MEASURES: dict[str, Measure] = {
     'without_model': lambda s: ratio(s['n_without_model'], s['n_points'] + s['n_without_model']),
     'bias': share('error', 'n_points'),
     'rmse': lambda s: np.sqrt(ratio(s['square'], s['n_points'])),
-    'smse': share('square', 'deviation'),
     'within_1': share('n_within_1', 'n_with_std'),
     'within_2': share('n_within_2', 'n_with_std'),
 }
 """Measures of `height_sums`; lengths in metres.
 
 The share of the points under which the surface has no height; bias, the mean error; RMSE; the
-standardised mean squared error, mean((y - mu)^2) / var(y) (paper, section IV); the shares within
-one and two standard deviations, of a normal distribution 0.683 and 0.954.
+shares within one and two standard deviations, of a normal distribution 0.683 and 0.954.
 """
 
 
@@ -122,15 +114,6 @@ def _counts(label: Labels, truth: Labels, group: IntArray, n_groups: int) -> Int
     return np.bincount(code[scored], minlength=4 * n_groups).reshape(n_groups, 4)
 
 
-def check_lengths(n_points: int, **values: Any) -> None:
-    """Raise `PointCloudError` for an array without one value per point; None is left out."""
-    for name, array in values.items():
-        if array is not None and array.shape != (n_points,):
-            raise PointCloudError(
-                f'{name} of shape {array.shape} for {n_points} points: must be ({n_points},)'
-            )
-
-
 def height_sums(
     truth: npt.NDArray[np.floating],
     estimate: npt.NDArray[np.floating],
@@ -140,21 +123,19 @@ def height_sums(
 
     Points whose estimate is NaN, because there is no model, are in `n_without_model` only. `std`
     are the standard deviations of the differences, (n,) [m], if there are any. The error is
-    estimate minus truth; `deviation` is of the truth from its mean. `median_absolute` is no sum.
+    estimate minus truth. `median_absolute` is no sum.
     """
     known = np.isfinite(estimate)
-    y = truth[known].astype(np.float64)
-    error = estimate[known] - y
-    spread = np.full(len(y), np.nan) if std is None else std[known]
+    error = estimate[known] - truth[known].astype(np.float64)
+    spread = np.full(len(error), np.nan) if std is None else std[known]
     return {
-        'n_points': len(y),
-        'n_without_model': len(truth) - len(y),
+        'n_points': len(error),
+        'n_without_model': len(truth) - len(error),
         'error': float(error.sum()),  # [m]
         # Of a product of vectors the last digits depend on the number of threads.
         'square': float(np.square(error).sum()),  # [m^2]
-        'deviation': float(np.sum((y - y.mean()) ** 2)) if len(y) else 0.0,  # [m^2]
         'n_with_std': int(np.isfinite(spread).sum()),
         'n_within_1': int((np.abs(error) <= spread).sum()),
         'n_within_2': int((np.abs(error) <= 2.0 * spread).sum()),
-        'median_absolute': float(np.median(np.abs(error))) if len(y) else math.nan,
+        'median_absolute': float(np.median(np.abs(error))) if len(error) else math.nan,
     }

@@ -1,4 +1,4 @@
-"""Objects lost: what stands on the ground and is called ground, by class and range.
+"""Objects lost: what stands on the ground and is called ground, by class.
 
 An object is lost where more than half of its returns from `MIN_HEIGHT` above the local ground are
 called ground. What lies below does not count: there the feet of an object and the ground mix.
@@ -9,7 +9,6 @@ part is cut off, and **false cells**, ground that a costmap takes for an obstacl
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,16 +17,12 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, Label
-from gp_ground_seg.lab.scoring.metrics import Labels, check_lengths, range_titles
+from gp_ground_seg.lab.scoring.metrics import Labels
 
 MIN_HEIGHT = 0.3
 """Height above the local ground from which on a return on an object counts [m]."""
 MIN_RETURNS = 10
 """Such returns that an object needs to be counted: of fewer, half is chance."""
-
-BAND_EDGES = (0.0, 10.0, 20.0, 40.0, math.inf)
-"""Edges of the bands of horizontal range [m]; each holds its inner edge, not its outer one."""
-BAND_TITLES = range_titles(BAND_EDGES)
 
 CELL_SIZE = 0.5  # of the cells of ground that is known [m]
 N_CELLS = 5  # of them that make the local ground
@@ -80,54 +75,36 @@ OBJECT_COUNTS = ('n_returns', 'n_ground', 'n_objects', 'n_lost')
 def count_objects(
     points: npt.NDArray[np.floating], label: Labels, objects: Objects
 ) -> list[dict[str, Any]]:
-    """Count returns on objects and objects called ground, in a row for each class and band.
+    """Count returns on objects and objects called ground, in a row for each class.
 
     `points` (N, >=3) are x, y, z [m], `label` (N,) what a method says of them; UNKNOWN is not
-    ground. A return counts in the band of its horizontal range, an object in that of the
-    median of its returns that count. Classes without a return that counts are left out.
+    ground. Classes without a return that counts are left out.
     """
-    check_lengths(len(points), **objects._asdict())
-    x, y, z = points[:, :3].astype(np.float64).T
-    reach = np.hypot(x, y)
-    on = (objects.class_of >= 0) & np.isfinite(reach + z)
+    xyz = points[:, :3].astype(np.float64)
+    on = (objects.class_of >= 0) & np.isfinite(xyz).all(axis=1)
     least = np.where(_is_low(objects.class_of), LOW_MIN_HEIGHT, MIN_HEIGHT)
-    counts = on & (z - objects.ground_z >= least)
-    kind, reach, is_ground = objects.class_of[counts], reach[counts], label[counts] == Label.GROUND
-    returns = _by_class_and_band(kind, reach, is_ground)
-
+    counts = on & (xyz[:, 2] - objects.ground_z >= least)
+    kind, is_ground = objects.class_of[counts], label[counts] == Label.GROUND
     known = (object_id := objects.object_id[counts]) != 0
     pairs = np.column_stack([kind, object_id])[known]
     of_object, number, n_returns = np.unique(
         pairs, axis=0, return_inverse=True, return_counts=True
     )
-    number = number.reshape(-1)
-    n_ground = np.bincount(number, is_ground[known], minlength=len(n_returns))
-    middle = _medians(reach[known], number, len(n_returns))
-    enough = n_returns >= np.where(_is_low(of_object[:, 0]), LOW_MIN_RETURNS, MIN_RETURNS)
-    lost = 2 * n_ground[enough] > n_returns[enough]
-    found = _by_class_and_band(of_object[enough, 0], middle[enough], lost)
-    bands = np.concatenate([returns, found], axis=2)
+    n_ground = np.bincount(number.reshape(-1), is_ground[known], minlength=len(n_returns))
+    kinds = of_object[:, 0]
+    enough = n_returns >= np.where(_is_low(kinds), LOW_MIN_RETURNS, MIN_RETURNS)
+    counted = kind, kind[is_ground], kinds[enough], kinds[enough & (2 * n_ground > n_returns)]
+    table = np.column_stack([np.bincount(part, minlength=len(CLASSES)) for part in counted])
     return [
-        {'class': name, 'range': band, **dict(zip(OBJECT_COUNTS, numbers, strict=True))}
-        for name, found in zip(CLASSES, bands.tolist(), strict=True)
-        if any(map(any, found))
-        for band, numbers in zip(BAND_TITLES, found, strict=True)
+        {'class': name, **dict(zip(OBJECT_COUNTS, numbers, strict=True))}
+        for name, numbers in zip(CLASSES, table.tolist(), strict=True)
+        if numbers[0]
     ]
 
 
 def _is_low(class_of: npt.NDArray[np.integer]) -> BoolArray:
     """Whether objects are of `LOW_CLASSES`, the last of all."""
     return class_of >= len(CLASSES) - len(LOW_CLASSES)
-
-
-def _by_class_and_band(
-    kind: npt.NDArray[np.integer], reach: FloatArray, is_counted: BoolArray
-) -> IntArray:
-    """Count (classes, bands, 2): all, and those with `is_counted`."""
-    n_classes, n_bands = len(CLASSES), len(BAND_TITLES)
-    code = n_bands * kind + np.digitize(reach, BAND_EDGES[1:-1])
-    n = [np.bincount(part, minlength=n_classes * n_bands) for part in (code, code[is_counted])]
-    return np.column_stack(n).reshape(n_classes, n_bands, 2)
 
 
 def _medians(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:

@@ -78,7 +78,6 @@ class Table(NamedTuple):
     title: str
     frame: DataFrame
     forms: Mapping[str, Form] = {}
-    notes: Sequence[str] = ()
 
     def form(self, name: str) -> Form:
         """Return the form of a column; one of the other method has that of ours."""
@@ -89,7 +88,7 @@ class Table(NamedTuple):
         return found or Form(name)
 
     def text(self, *, markdown: bool = False) -> str:
-        """Return title, cells and notes, for the terminal or as Markdown; ``-`` is none."""
+        """Return title and cells, for the terminal or as Markdown; ``-`` is none."""
         forms = [self.form(name) for name in self.frame]
         cells = self.frame.reset_index(drop=True).astype(object)
         for name, (_, style, scale) in zip(cells, forms, strict=True):
@@ -102,9 +101,9 @@ class Table(NamedTuple):
         if markdown:
             sides = ['right' if form.format else 'left' for form in forms]
             table = cells.to_markdown(index=False, disable_numparse=True, colalign=sides)
-            return '\n\n'.join([self.title, table, *self.notes])
-        rows = [cells.to_string(index=False)] if len(cells) else []
-        return '\n'.join([self.title, *rows, *self.notes])
+            return f'{self.title}\n\n{table}'
+        table = f'\n{cells.to_string(index=False)}' if len(cells) else ''
+        return f'{self.title}{table}'
 
 
 def frame_of(rows: Any, columns: Sequence[str] | None = None) -> DataFrame:

@@ -23,7 +23,6 @@ from gp_ground_seg.lab.scoring.report import (
     Form,
     Report,
     Table,
-    frame_of,
     records,
 )
 
@@ -49,6 +48,11 @@ MEASURES: dict[str, Measure] = {
 IOU = MEASURES['iou']
 HEIGHTS = 'without_model', 'bias', 'rmse', 'median_absolute', 'within_1', 'within_2'
 """Measures of the heights that are shown."""
+PEERS = (
+    'iou', 'rmse', 'share_ground', 'n_lost', 'lost_vehicles', 'lost_persons', *objects.SHARES,
+    *objects.LOW_CLASSES,
+)  # fmt: skip
+"""Columns that tables have of the peer too."""
 COMPARED = {
     'iou': 'IoU [%]',
     'precision': 'precision [%]',
@@ -75,17 +79,18 @@ def clusters(scores: Scores) -> DataFrame:
     return found.assign(cluster=np.searchsorted(ends, np.arange(n), side='right'))
 
 
-def difference_interval(
+def interval_text(
     scores: Scores,
     other: str,
     measure: Measure,
     frame: DataFrame | None = None,
     ours: str = '',
-) -> tuple[float, float] | None:
+) -> str | None:
     """Interval of a measure of ours, by default the first method, minus that of another.
 
-    It is of the pooled scans, or of the rows of another `frame` of the scores. None with fewer
-    than two clusters, or where a ratio is over nothing. It draws in the same way each time.
+    It is of the pooled scans, or of the rows of another `frame` of the scores, in percent or cm:
+    ``-0.10 to +0.25 tie``. None with fewer than two clusters, or where a ratio is over nothing.
+    It draws in the same way each time.
     """
     of_scan = clusters(scores)
     names = of_scan['cluster'].unique()
@@ -105,23 +110,8 @@ def difference_interval(
     if np.isnan(difference).any():
         return None
     tail = 0.5 * (1.0 - CONFIDENCE)
-    low, high = np.quantile(difference, [tail, 1.0 - tail]).tolist()
-    return low, high
-
-
-def interval_text(
-    scores: Scores,
-    other: str,
-    measure: Measure,
-    frame: DataFrame | None = None,
-    ours: str = '',
-) -> str | None:
-    """`difference_interval` in percent or cm, as in ``-0.10 to +0.25 tie``; None without one."""
-    found = difference_interval(scores, other, measure, frame, ours)
-    if found is None:
-        return None
-    low, high = found
-    return f'{100.0 * low:+.2f} to {100.0 * high:+.2f}' + ' tie' * (low <= 0.0 <= high)
+    low, high = np.quantile(100.0 * difference, [tail, 1.0 - tail])
+    return f'{low:+.2f} to {high:+.2f}{" tie" if low <= 0.0 <= high else ""}'
 
 
 def interval_note(scores: Scores) -> str:
@@ -136,21 +126,20 @@ def interval_note(scores: Scores) -> str:
     return f'95 % interval: bootstrap over {n} {kind}{few}; tie: it holds 0'
 
 
-def beside(found: DataFrame, scores: Scores, *compared: str) -> DataFrame:
-    """Return the rows of ours, with each column `compared` of the peer after that of ours.
+def beside(found: DataFrame, scores: Scores) -> DataFrame:
+    """Return the rows of ours, with the columns of `PEERS` of the peer after those of ours.
 
-    `found` has the methods in the first level of its index. If ``iou`` is compared, the last
-    column is the difference. Without a peer there is nothing to compare.
+    `found` has the methods in the first level of its index. With ``iou`` the last column is the
+    difference. Without a peer there is nothing to compare.
     """
     ours = found.loc[scores.methods[0]]
     if not scores.peer:
         return ours
-    peer = found.loc[scores.peer, [name for name in compared if name in found]].add_prefix(PEER)
-    both = ours.join(peer)
+    both = ours.join(found.loc[scores.peer, found.columns.intersection(PEERS)].add_prefix(PEER))
     both = both[[
         column for name in ours for column in (name, f'{PEER}{name}') if column in both
     ]]  # fmt: skip
-    return both.assign(difference=both['iou'] - both['peer_iou']) if 'iou' in compared else both
+    return both.assign(difference=both['iou'] - both['peer_iou']) if 'iou' in both else both
 
 
 def with_measures(sums: DataFrame) -> DataFrame:
@@ -195,29 +184,27 @@ def evaluation(scores: Scores, config: Config) -> Report:
     if scores.has_truth:
         tables['groundgrid'] = _grouped(
             scores, 'GroundGrid convention: vegetation left out [%]',
-            scores.scans, ['sequence'], ['n_scans', *metrics.LABEL_MEASURES], ['iou'],
+            scores.scans, 'sequence', ['n_scans', *metrics.LABEL_MEASURES],
         )  # fmt: skip
         tables['low_things'] = _grouped(
-            scores, 'Low things and false cells [%]', scores.scans, ['sequence'],
+            scores, 'Low things and false cells [%]', scores.scans, 'sequence',
             [column for name in objects.SHARES for column in (f'{name}_n', name)],
-            [*objects.SHARES],
         )  # fmt: skip
         tables['heights'] = _grouped(
             scores, 'Height of the ground under returns labelled ground [cm]; shares without a '
             'model and within one and two standard deviations [%]',
-            scores.scans, ['sequence'], ['n_points', *HEIGHTS], ['rmse'],
+            scores.scans, 'sequence', ['n_points', *HEIGHTS],
         )  # fmt: skip
         minus = f' minus that of {scores.peer}' if scores.peer else ''
         tables['rings'] = _grouped(
             scores, f'IoU{minus} by horizontal range (GroundGrid convention) [%]',
-            scores.rings, ['range'], [*metrics.LABEL_MEASURES], ['iou'], 'iou',
+            scores.rings, 'range', [*metrics.LABEL_MEASURES], 'iou',
         )  # fmt: skip
     if len(scores.objects):
         tables['objects'] = _grouped(
             scores, 'Objects: returns on them, and the share called ground [%]; objects, and '
-            'those lost', scores.objects, ['class', 'range'],
-            ['n_returns', 'share_ground', 'n_objects', 'n_lost'], ['share_ground', 'n_lost'],
-            'share_ground',
+            'those lost', scores.objects, 'class',
+            ['n_returns', 'share_ground', 'n_objects', 'n_lost'], 'share_ground',
         )  # fmt: skip
     if scores.peer:
         tables['measures'] = difference_table(scores)
@@ -228,28 +215,25 @@ def _grouped(
     scores: Scores,
     title: str,
     frame: DataFrame,
-    by: list[str],
+    by: str,
     columns: list[str],
-    compared: list[str],
     interval: str = '',
 ) -> Table:
-    """Lay out measures of the groups of a frame, and of all in the last column of `by`.
+    """Lay out measures of the groups of a frame, and of all but for classes of objects.
 
     The measure `interval` has one of the difference to the peer.
     """
-    rows = with_all(frame, by[-1])
-    found = measured(rows, *by)
+    rows = frame if by == 'class' else with_all(frame, by)
+    found = measured(rows, by)
     if 'n_lost' in found:
         found['n_lost'] = found['n_lost'].where(found['n_objects'] > 0)
-    table = beside(found[[name for name in columns if name in found]], scores, *compared)
-    table = table.reset_index()
-    if by[0] == 'class':
+    table = beside(found[[name for name in columns if name in found]], scores).reset_index()
+    if by == 'class':
         order = [*objects.CLASSES].index
-        table = table.sort_values('class', key=lambda own: own.map(order), kind='stable')
+        table = table.sort_values('class', key=lambda own: own.map(order))
     title += peer_note(scores)
     if interval and scores.peer:
-        groups = [rows.merge(table.loc[[k], by]) for k in table.index]
-        measure = MEASURES[interval]
+        groups, measure = (rows[rows[by] == name] for name in table[by]), MEASURES[interval]
         table['interval'] = [interval_text(scores, scores.peer, measure, own) for own in groups]
         title += f'; {COMPARED[interval].removesuffix(" [%]")}: {interval_note(scores)}'
     return Table(title, table)
@@ -260,19 +244,13 @@ def difference_table(scores: Scores) -> Table:
     other = scores.peer
     found = measured(scores.scans).loc[[scores.methods[0], other]]
     found = found[[name for name in COMPARED if name in found]].dropna(axis='columns', how='all')
-    rows = [
-        {
-            'measure': COMPARED[name],
-            'given': given,
-            'peer': peer,
-            'difference': given - peer,
-            'interval': interval_text(scores, other, MEASURES[name]),
-        }
-        for name, (given, peer) in found.items()
-    ]
+    table = found.T.set_axis(['given', 'peer'], axis='columns')
+    table['difference'] = table['given'] - table['peer']
+    table['interval'] = [interval_text(scores, other, MEASURES[name]) for name in table.index]
+    table = table.rename(index=COMPARED).reset_index(names='measure')
     forms = {'given': Form('given', *SHARE), 'peer': Form(other, *SHARE)}
-    title = f'Given minus {other}; {interval_note(scores)}'
-    return Table(title, frame_of(rows), forms, [_changed_note(scores.scans, other)])
+    title = f'Given minus {other}; {_changed_note(scores.scans, other)}; {interval_note(scores)}'
+    return Table(title, table, forms)
 
 
 def _changed_note(scans: DataFrame, other: str) -> str:

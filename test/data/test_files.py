@@ -1,0 +1,189 @@
+"""Files of every kind: what is read of them, the one line that refuses them, and little memory."""
+
+import os
+import re
+import resource
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_samples import scan, write_ros1_bag, write_ros2_bag
+from cli_runner import error_line, run
+from evaluation_samples import write_frame
+from foreign_files import CASES, XYZ
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gp_ground_seg.core import errors
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.data.cloud_files import WRITABLE, decode_file, encode_file
+from gp_ground_seg.data.clouds import cloud_of, name_columns
+from gp_ground_seg.data.inputs import list_inputs
+
+
+def read(path):
+    """Names of the fields, or topic and number of clouds; all clouds. Else the line, and none."""
+    try:
+        inputs = list_inputs(path)
+        clouds = [one.read() for one in inputs]
+    except DataError as error:
+        said = str(error)
+        assert said.startswith(f'{path}: ') and '\n' not in said
+        return said, []
+    return f'{inputs.topic} {len(clouds)}' if inputs.topic else clouds[
+        0
+    ].fields.dtype.names, clouds
+
+
+def resident(key):
+    """Memory of this process [bytes]: now by VmRSS, the most so far by VmHWM."""
+    return 1024 * int(re.search(rf'{key}:\s*(\d+)', Path('/proc/self/status').read_text())[1])
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('name', CASES)
+def test_what_is_needed_is_read_of_every_file_or_the_reason_said(tmp_path, name):
+    """One part that is not needed does not stop the reading; what cannot be takes no memory."""
+    content, expected = CASES[name]
+    path = tmp_path / name
+    if callable(content):
+        content(path)
+    elif content is not None:
+        path.write_bytes(content)
+    Path('/proc/self/clear_refs').write_text('5')
+    before = resident('VmRSS')
+    found, clouds = read(path)
+    assert resident('VmHWM') < before + 200_000_000
+    for cloud in clouds:
+        np.testing.assert_array_equal(cloud.xyz, XYZ[:1] if name == 'one_point.pcd' else XYZ)
+    if clouds:
+        assert found in (expected, tuple(expected.split()))
+    else:
+        assert re.search(expected, found)
+
+
+def test_what_is_left_out_is_told_once(tmp_path, caplog):
+    caplog.set_level('INFO', 'gp_ground_seg')
+    errors._logged.clear()
+    for name in ('list_last.ply', 'list_last_text.ply', 'list_last_big.ply', 'nan_as_integer.pcd'):
+        decode_file(tmp_path / name, CASES[name][0])
+    assert caplog.messages == [
+        'PLY: lists of the vertices are left out: views, w',
+        'field ring: has numbers that are no uint16; read as float64',
+    ]
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory):
+    """A small file of every format."""
+    folder = tmp_path_factory.mktemp('whole')
+    table = name_columns(scan(n_ground=150, n_wall=50))
+    for suffix in WRITABLE:
+        path = folder / f'a{suffix}'
+        path.write_bytes(encode_file(path, cloud_of(table), {}))
+    for name in ('a.mcap', 'a.db3'):
+        write_ros2_bag(folder / name, n_clouds=2, n_ground=20, n_wall=5)
+    write_ros1_bag(folder / 'a.bag', n_clouds=1)
+    return folder
+
+
+@pytest.mark.parametrize('suffix', [*WRITABLE, '.mcap', '.db3', '.bag'])
+@settings(max_examples=60)
+@given(data=st.data())
+def test_damage_is_reported_in_one_line(whole, tmp_path_factory, suffix, data):
+    """A file that was cut is refused; overwritten bytes may go unnoticed."""
+    content = (whole / f'a{suffix}').read_bytes()
+    place = data.draw(st.integers(0, len(content) - 1) | st.integers(0, 500))
+    damaged = tmp_path_factory.mktemp('damaged') / f'a{suffix}'
+    damaged.write_bytes(content[:place])
+    assert not read(damaged)[1]
+    junk = data.draw(st.binary(min_size=1, max_size=16))
+    damaged.write_bytes(content[:place] + junk + content[place + len(junk) :])
+    read(damaged)
+
+
+@pytest.mark.parametrize('n_bytes', [1, 8, 4095, 4096, 5000])
+def test_sqlite_bag_that_lost_its_last_bytes(whole, tmp_path, n_bytes):
+    # sqlite itself would read zeros there.
+    content = (whole / 'a.db3').read_bytes()[:-n_bytes]
+    (tmp_path / 'cut.db3').write_bytes(content)
+    expected = f'truncated, {len(content)} bytes where its header says {len(content) + n_bytes}'
+    assert expected in read(tmp_path / 'cut.db3')[0]
+
+
+HUGE = (
+    ('segment SCAN -o a.label', 'SCAN', f'accepted are at most {1 << 30}'),
+    ('evaluate ROOT', 'LABEL', 'expected 7204 for 1801 points'),
+    ('plot scan SCAN --labels LABEL -o a.png', 'LABEL', 'expected 7204 for 1801 points'),
+    ('evaluate ROOT', 'TIMES', 'accepted are at most'),
+    ('segment SCAN --config YAML -o a.label', 'YAML', 'too large for a parameter file'),
+)
+
+
+@pytest.mark.parametrize(('words', 'huge', 'message'), HUGE)
+def test_huge_files_are_refused_by_their_size(tmp_path, monkeypatch, capsys, words, huge, message):
+    monkeypatch.chdir(tmp_path)
+    points = scan()
+    write_frame(tmp_path, '00', 0, points, np.full(len(points), 40, '<u4'))
+    paths = {
+        'ROOT': '.', 'SCAN': 'sequences/00/velodyne/000000.bin', 'YAML': 'a.yaml',
+        'LABEL': 'sequences/00/labels/000000.label', 'TIMES': 'sequences/00/times.txt',
+    }  # fmt: skip
+    with open(paths[huge], 'ab') as file:
+        os.truncate(file.fileno(), 300 * 10**9)
+    assert run(*(paths.get(word, word) for word in words.split())) == 2
+    assert re.search(f'{re.escape(paths[huge])}: .*{message}', error_line(capsys))
+
+
+def test_too_little_memory_is_one_line(tmp_path, capsys):
+    """The largest scan that is taken, and less memory than that takes."""
+    (tmp_path / 'a.bin').touch()
+    os.truncate(tmp_path / 'a.bin', 1 << 30)
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (resident('VmSize') + (1 << 29), before[1]))
+    try:
+        assert run('segment', tmp_path / 'a.bin', '-o', tmp_path / 'a.label') == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+    assert error_line(capsys) == 'not enough memory for this input'
+
+
+ESCAPED = {
+    'a\x1b[31m\nb': r'a\x1b[31m\nb',
+    os.fsdecode(b'a\xff\xfe'): r'a\udcff\udcfe',
+    'a$\\x_{$': 'a$\\x_{$',
+    '[a*]{0}%s': '[a*]{0}%s',
+    ' \u202e\u2028\x7f ä ': r' \u202e\u2028\x7f ä ',
+}
+
+
+@pytest.mark.usefixtures('compiled_code')
+@pytest.mark.parametrize('name', ESCAPED)
+def test_any_name_is_read_written_and_shown_escaped(tmp_path, monkeypatch, capsys, name):
+    monkeypatch.chdir(tmp_path)
+    points = scan(n_ground=6000)
+    points.tofile(f'{name}.bin')
+    write_ros2_bag(tmp_path / f'{name}.mcap')
+    write_frame(tmp_path / name, name, 0, points, np.full(len(points), 40, '<u4'))
+    (tmp_path / f'{name}.yaml').write_text('sensor: {height: 1.7}')
+    for line in (
+        'segment|NAME.bin|-o|NAME.label|--config|NAME.yaml',
+        'segment|NAME.mcap|-o|NAME_ground.mcap',
+        'segment|NAME|-o|NAME_out',
+        'plot|scan|NAME.bin|-o|NAME.svg',
+        'evaluate|NAME.mcap|--against|NAME.yaml',
+        'config|check|NAME.yaml',
+    ):
+        assert run(*line.replace('NAME', name).split('|')) == 0
+        said = capsys.readouterr()
+        assert all(text.isprintable() for text in (said.out + said.err).splitlines()), line
+    assert run('segment', f'{name}.bin', '-o', f'{name}.label') == 2
+    expected = f'{ESCAPED[name]}.label: exists already; --force replaces it'
+    assert error_line(capsys) == expected
+    # A loop of links, and a name that is too long for a file.
+    for a, b in ('ab', 'ba'):
+        os.symlink(f'{a}.npy', f'{b}.npy')
+    for bad in ('a.npy', 400 * 'a' + '.npy'):
+        for words in (('segment', bad, '-o', 'out'), ('segment', f'{name}.bin', '-o', bad)):
+            assert run(*words) == 2
+            assert bad in error_line(capsys)
