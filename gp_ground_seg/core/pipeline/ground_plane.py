@@ -53,9 +53,9 @@ REFUTATION = 8.0
 """Weight of a ray that crosses the plane over that of a point on it at `MIDDLE`."""
 APART, PARALLEL = 0.3, 0.06
 """Distance of two levels, at least [m], and difference of their slopes, at most."""
-OVER_SHARE = 0.2
-"""Score of a level over the plane with the best one, over that, from which it may carry the robot:
-of the top of a dock only the nearest rings are seen."""
+OTHER_SHARE = 0.2
+"""Score of another level over the best one from which it counts, and may carry the robot: of the
+top of a dock only the nearest rings are seen."""
 CLEAN = 0.5
 """Share of the support in all evidence from which a level is not refuted."""
 ASIDE = 0.6
@@ -171,7 +171,7 @@ def _lowest(offsets: IntArray, r: FloatArray, z: FloatArray) -> tuple[IntArray, 
 class GroundPlane(NamedTuple):
     """The plane z = -height + slope_x x + slope_y y; `NO_PLANE` if no cell lies on any."""
 
-    height: float = 0.0  # how far below the origin of the cloud it is, along z [m]
+    height: float = 0.0  # how far below the sensor it is, along z [m]
     slope_x: float = 0.0  # rise per metre
     slope_y: float = 0.0  # rise per metre
     # as `height`, for the parallel plane through the middle of the near cells [m]
@@ -190,7 +190,7 @@ class GroundPlane(NamedTuple):
     # share of the sectors with any cell whose nearest is clearly over it, and below the sensor
     overhung: float = 0.0
     n_support: int = 0  # how many cells lie on it
-    # height as that of the plane itself, of the level next to it in score; NaN if there is none [m]
+    # as `height`, of the parallel level with the next best score [m]; NaN if there is none
     other_height: float = math.nan
 
     @property
@@ -212,32 +212,32 @@ class GroundPlane(NamedTuple):
 NO_PLANE = GroundPlane()
 
 
-def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> GroundPlane | None:
+def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     """Fit the plane that most of the lowest points lie on and few rays cross; None without one.
 
     Consensus (Fischler & Bolles, CACM 1981) over planes through a fixed, evenly spread
     choice of three cells and level planes through one, then a redescending M-estimator
     (Beaton & Tukey, Technometrics 1974) from the best of them. `max_slope` is that of the
-    steepest plane to look for, as rise per metre; `origin` is where the sensor is [m].
+    steepest plane to look for, as rise per metre.
     """
     cells = lowest_points(candidates)
-    plane = fit_cells(cells, len(cells.z), max_slope, origin)
+    plane = fit_cells(cells, len(cells.z), max_slope)
     return plane if plane.n_support > 0 else None
 
 
 @shared
-def fit_cells(cells: LowestPoints, n: int, max_slope: float, origin: Direction) -> GroundPlane:
+def fit_cells(cells: LowestPoints, n: int, max_slope: float) -> GroundPlane:
     """Fit a plane to the first `n` points."""
     is_found, best, other = False, (0.0, 0.0, 0.0), math.nan
     if n >= MIN_CELLS:
-        is_found, best, other = own_level(cells, n, max_slope, origin)
+        is_found, best, other = own_level(cells, n, max_slope)
     if not is_found:
         return NO_PLANE
     plane = refined(cells, best)
     if not is_possible(plane, LOOSER * max_slope):
         # The refinement has drifted off to a plane that cannot be the ground.
         plane = best
-    return described(cells, n, plane, origin, other)
+    return described(cells, n, plane, other)
 
 
 def _spread(n: int) -> FloatArray:
@@ -256,40 +256,34 @@ SPREAD = _spread(N_TRIPLES)
 
 
 @shared
-def own_level(
-    cells: LowestPoints, n: int, max_slope: float, origin: Direction
-) -> tuple[bool, Plane, float]:
+def own_level(cells: LowestPoints, n: int, max_slope: float) -> tuple[bool, Plane, float]:
     """Plane of the level that the robot stands on, whether there is one, and another's height.
 
-    It is the plane with the best score, or a level over it that is not refuted and lies around the
-    robot: top of a dock, of which less is seen than of what lies below it.
+    It is the plane with the best score, or a parallel one over it that is not refuted and lies
+    around the robot: the top of a dock, of which less is seen than of what lies below it.
     """
-    n_level, planes = min(n, N_LEVEL), hypotheses(cells, n, max_slope)
-    if len(planes) == 0:
-        return False, (0.0, 0.0, 0.0), math.nan
+    planes = hypotheses(cells, n, max_slope)
     supports = supports_of(planes, cells)
-    best, score, _ = best_of(planes, supports.copy(), cells, n, origin, 0.0)
+    best, score, _ = best_of(planes, supports, cells, n, 0.0)
     if score <= 0.0:
         return False, best, math.nan
-    is_level = (planes[:, 1] == 0.0) & (planes[:, 2] == 0.0)
+    height, slope_x, slope_y = planes[:, 0], planes[:, 1], planes[:, 2]
     if 0.0 < math.hypot(best[1], best[2]) < STRAIGHT:
-        level, other, _ = best_of(
-            planes, np.where(is_level, supports, 0.0), cells, n, origin, LEVEL_SHARE * score
-        )
-        if other > 0.0:
-            best, score = level, other
-    clearance = distance(origin[0], origin[1], origin[2], best)
-    is_over = planes[:, 0] + origin[2] < clearance - APART
-    apart = np.hypot(planes[:, 1] - best[1], planes[:, 2] - best[2])
-    is_over &= (planes[:, 0] + origin[2] > 0.0) & (apart < PARALLEL)
-    over, other, support = best_of(
-        planes, np.where(is_over, supports, 0.0), cells, n, origin, OVER_SHARE * score
-    )
-    if other <= 0.0:
-        return True, best, math.nan
-    if other >= CLEAN * support and is_around(cells, n, over, best):
+        levels = np.where(np.hypot(slope_x, slope_y) == 0.0, supports, 0.0)
+        level, level_score, _ = best_of(planes, levels, cells, n, LEVEL_SHARE * score)
+        if level_score > 0.0:
+            best, score = level, level_score
+    is_parallel = np.hypot(slope_x - best[1], slope_y - best[2]) < PARALLEL
+    is_over = is_parallel & (height > 0.0) & (height < best[0] - APART)
+    levels = np.where(is_over, supports, 0.0)
+    over, over_score, support = best_of(planes, levels, cells, n, OTHER_SHARE * score)
+    if over_score > CLEAN * support and is_around(cells, n, over, best):
         return True, over, best[0]
-    return True, best, over[0]
+    levels = np.where(is_parallel & (height > best[0] + APART), supports, 0.0)
+    under, under_score, _ = best_of(planes, levels, cells, n, OTHER_SHARE * score)
+    if over_score > under_score:
+        return True, best, over[0]
+    return True, best, under[0] if under_score > 0.0 else math.nan
 
 
 @shared
@@ -362,39 +356,25 @@ def is_possible(plane: Plane, max_slope: float) -> bool:
 
 @shared
 def best_of(
-    planes: FloatArray,
-    supports: FloatArray,
-    cells: LowestPoints,
-    n: int,
-    origin: Direction,
-    least: float,
+    planes: FloatArray, supports: FloatArray, cells: LowestPoints, n: int, least: float
 ) -> tuple[Plane, float, float]:
     """Plane with the best score above `least`, its score, 0 if there is none, and its support.
 
     The score is the support, times the share of it in all evidence. It is at most the support, so
-    that few planes need their refutation. `supports` (P,) are changed.
+    that few planes need their refutation.
     """
-    best, best_score, best_support = (0.0, 0.0, 0.0), 0.0, 0.0
-    while True:
-        p = np.argmax(supports)
-        support = supports[p]
+    left, best, best_score, best_support = supports.copy(), (0.0, 0.0, 0.0), 0.0, 0.0
+    while len(left) > 0:
+        p = np.argmax(left)
+        support = left[p]
         if support <= max(best_score, least):
-            return best, best_score, best_support
+            break
         plane = (planes[p, 0], planes[p, 1], planes[p, 2])
-        score = support * support / (support + refutation_of(plane, cells, n, origin))
+        score = support * support / (support + refutation_of(plane, cells, n))
         if score > max(best_score, least):
             best, best_score, best_support = plane, score, support
-        supports[p] = -1.0
-
-
-def supports_in(candidates: Candidates, planes: list[Plane]) -> FloatArray:
-    """Support of planes by a scan, (P,)."""
-    return supports_of(np.array(planes), lowest_points(candidates))
-
-
-def plane_across(up: Direction, depth: float) -> Plane:
-    """Plane across a unit vector, whose `z` is not 0, at a distance below the origin [m]."""
-    return depth / up[2], -up[0] / up[2], -up[1] / up[2]
+        left[p] = -1.0
+    return best, best_score, best_support
 
 
 def supports_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
@@ -430,13 +410,13 @@ def support_by(
     return np.floor(choose(support > 0.0, support, 0.0))
 
 
-def refutation_of(plane: Plane, cells: LowestPoints, n: int, origin: Direction) -> float:
-    """Weight of the rays from `origin` that cross a plane where it should have stopped them.
+def refutation_of(plane: Plane, cells: LowestPoints, n: int) -> float:
+    """Weight of the rays that cross a plane where it should have stopped them.
 
-    These are rays to points clearly below, but for points that lie alone. In a sector the plane is taken to reach as far as
-    its farthest point, at least `LEAST_REACH`: over the edge of a dike or a dock rays pass. A
-    cell with a point on the plane has stopped rays: what crosses there is a mirror image on a wet
-    road. The plane of roofs of cars, or of tables, is crossed near the sensor, before it begins.
+    These are rays to points clearly below it that do not lie alone. In a sector the plane is taken
+    to reach as far as its farthest point, at least `LEAST_REACH`: over the edge of a dike or a
+    dock rays pass. A cell with a point on the plane has stopped rays: what crosses there is a
+    mirror image on a wet road. Roofs of cars, and tables, are crossed next to the sensor.
     """
     height = distance(cells.x, cells.y, cells.z, plane)
     d, sector = height * cells.inverse, cells.cell // N_RINGS
@@ -445,21 +425,20 @@ def refutation_of(plane: Plane, cells: LowestPoints, n: int, origin: Direction) 
     is_seen[cells.cell[is_on]] = True
     np.maximum.at(reach, sector[is_on], cells.r[is_on])
     sector = sector[is_below]
-    clearance = distance(*origin, plane)
-    crossing = crossed_at(cells.r[is_below], height[is_below], clearance)
+    crossing = crossed_at(cells.r[is_below], height[is_below], plane[0])
     crossed = sector * N_RINGS + np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
     counts = (crossing < reach[sector]) & ~is_seen[crossed]
     return float(refutation_by(crossing[counts]).sum())
 
 
 @shared
-def crossed_at(r: Values, height: Values, clearance: Values) -> Values:
+def crossed_at(r: Values, height: Values, clearance: float) -> Values:
     """Range where the ray to a point below a plane crosses it, from `clearance` above [m].
 
     `height` is that of the point, negative. A ray that is below the plane all the way, as that of
     a ceiling, is taken to cross it where it ends.
     """
-    return choose(clearance > 0.0, r * clearance / (clearance - height), r)
+    return r * clearance / (clearance - height) if clearance > 0.0 else r
 
 
 @shared
@@ -520,9 +499,7 @@ def solve_plane(moments: Moments, plane: Plane) -> Plane:
 
 
 @shared
-def described(
-    cells: LowestPoints, n: int, plane: Plane, origin: Direction, other_height: float
-) -> GroundPlane:
+def described(cells: LowestPoints, n: int, plane: Plane, other_height: float) -> GroundPlane:
     """Measure how well a plane is seen."""
     height, slope_x, slope_y = plane
     ranges, drops, near, angles = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
@@ -537,15 +514,14 @@ def described(
         # Cells come sector by sector: one that differs from the last is new.
         if sector != last_seen:
             n_seen, last_seen = n_seen + 1, sector
-            n_overhung += d > CLEARLY_OFF * cells.tolerance[c] and z < origin[2]
+            n_overhung += d > CLEARLY_OFF * cells.tolerance[c] and z < 0.0
         if not abs(d) <= cells.tolerance[c]:
             z = cells.lowest_z[c]
             d = distance(cells.x[c], cells.y[c], z, plane)
         if not abs(d) <= cells.tolerance[c]:
             continue
-        away = math.hypot(cells.x[c] - origin[0], cells.y[c] - origin[1])
-        ranges[n_on_it], drops[n_on_it] = r, math.atan2(origin[2] - z, away)
-        angles[n_on_it] = math.atan2(distance(origin[0], origin[1], origin[2], plane) - d, away)
+        ranges[n_on_it], drops[n_on_it] = r, math.atan2(-z, r)
+        angles[n_on_it] = math.atan2(height - d, r)
         n_on_it += 1
         weight += cells.weight[c]
         if r < NEAR:

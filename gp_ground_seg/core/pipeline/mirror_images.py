@@ -20,25 +20,19 @@ from gp_ground_seg.core.frame import (
     IntArray,
     PointArray,
     Scan,
-    Values,
 )
-from gp_ground_seg.core.jit import shared
-from gp_ground_seg.core.parameters.config import SensorConfig
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane, tolerance_at
 from gp_ground_seg.core.pipeline.low_sensor import is_seen_from_sensor
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
 DEEP = 0.15
 """Depth below the plane from which a return may be an image [m]: more than that of a kerb."""
-BELOW_SIGHT = 0.03
-"""Depth at which a ray must pass below ground that is seen nearer [m], to tell a wet road."""
 OVER_SIGHT = 0.05
-"""Height up to which a ray to an image passes over ground that is seen nearer, where the road is
-known to be wet [m]: noise. Of rays that meet the road side by side some come back from the road,
-others from what they are mirrored to."""
+"""Height up to which a ray to an image passes over ground that is seen nearer [m]: noise. Of rays
+that meet the road side by side some come back from it, others from what they are mirrored to."""
 NEAREST, GROUND_REACH, IMAGE_REACH = 1.0, 40.0, 60.0
-"""Range from which returns may be images, up to which ground tells them, and up to which they are
-told [m]: nearer there may be the robot itself."""
+"""Range from which returns may be images, up to which ground tells them, and up to which they may
+be [m]: nearer there may be the robot itself."""
 N_ASIDE = 4
 """Segments on each side whose ground tells the images of a segment."""
 WET_SHARE, WET_REACH = 0.1, 20.0
@@ -48,8 +42,8 @@ COUNTERPART = 0.2
 """Distance of a raised image to what it is an image of, at most about this [m]."""
 MIRRORED, MAYBE_MIRRORED = 0.4, 0.12
 """Share of what is deep below a plane that has a counterpart over it, from which the plane is a
-mirror, and from which it may be one that is not quite found: of dry scans the most was 0.08, of
-wet ones 0.7 to 0.96, and 0.2 to 0.45 with a wrong plane."""
+mirror, and from which there may be one nearby: of dry scans outdoors the most was 0.22, of wet
+ones 0.45 to 0.88, and 0.13 to 0.35 with a plane that is off."""
 
 
 class MirrorImages(NamedTuple):
@@ -73,27 +67,29 @@ class MirrorImages(NamedTuple):
         return scan._replace(candidates=candidates.where(~is_image))
 
 
-def find_mirror_images(scan: Scan, pose: SensorPose, sensor: SensorConfig) -> MirrorImages:
+def find_mirror_images(scan: Scan, pose: SensorPose) -> MirrorImages:
     """Find the mirror images of a scan in the level frame: none unless the road is wet.
 
-    Where rays start must be known: at the origin of the cloud, or above or below it at that of the
-    parameters, and above the plane. Else there are none.
+    An image is deep below the plane, and hardly above the line of sight to ground that is seen
+    nearer. Where rays start must be known, or nothing is told.
     """
     none = MirrorImages(np.zeros(0, dtype=np.int64), np.zeros(0))
-    x, y, up = (pose.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)).tolist()
-    if not is_seen_from_sensor(pose) or (x, y) != (0.0, 0.0):
+    grid, plane_z = scan.grid, -pose.sensor_height
+    if not (is_seen_from_sensor(pose) and plane_z < 0.0):
         return none
-    grid, plane_z = scan.grid, -pose.height
-    if not (up > plane_z and mirror_share(GroundPlane(pose.height), scan) >= MIRRORED):
+    if mirror_share(GroundPlane(pose.sensor_height), scan) < MIRRORED:
         return none
     inside = np.flatnonzero(grid.inside)
     r, z = grid.r[inside].astype(np.float64), scan.xyz[inside, 2].astype(np.float64)
-    slope, cell = slope_of_sight(r, z, up), grid.cell[inside].astype(np.int64)
-    is_ground = (r < GROUND_REACH) & is_on_plane(r, z, plane_z)
+    slope, cell = slope_of_sight(r, z), grid.cell[inside].astype(np.int64)
+    is_ground = (r >= NEAREST) & (r < GROUND_REACH) & (np.abs(z - plane_z) <= tolerance_at(r))
     shape = grid.n_segments, grid.n_bins
     nearer = _nearer_about(slope[is_ground], cell[is_ground], shape, N_ASIDE)[cell]
-    found = is_image(r, z, slope, nearer, plane_z, up, -OVER_SIGHT)
-    return MirrorImages(inside[found], -2.0 * (z[found] + pose.height))
+    may_be = (z < plane_z - DEEP) & (r >= NEAREST) & (r < IMAGE_REACH)
+    # Only a line of sight that points down meets the plane: at its height over its slope.
+    may_be &= (nearer < 0.0) & ((slope - nearer) * plane_z > OVER_SIGHT * nearer)
+    found = np.flatnonzero(may_be)
+    return MirrorImages(inside[found], -2.0 * (z[found] - plane_z))
 
 
 @np.errstate(invalid='ignore', over='ignore')
@@ -106,9 +102,9 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     candidates = scan.candidates
     near = np.flatnonzero((candidates.r >= NEAREST) & (candidates.r < WET_REACH))
     place = np.column_stack([candidates.x, candidates.y, candidates.z])[near]
-    over = plane.below(*place.T)
-    deep, n_ground = over < -DEEP, np.count_nonzero(np.abs(over) <= tolerance_at(candidates.r[near]))
-    if np.count_nonzero(deep) <= WET_SHARE * n_ground:
+    over, tolerance = plane.below(*place.T), tolerance_at(candidates.r[near])
+    deep = over < -DEEP
+    if np.count_nonzero(deep) <= WET_SHARE * np.count_nonzero(np.abs(over) <= tolerance):
         return 0.0
     normal = np.array(plane.normal)
     raised = place[deep] - (2.0 * over[deep] * normal[2])[:, None] * normal
@@ -124,13 +120,13 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     return float(has_return[tuple((box + steps).T)].any(axis=1).mean())
 
 
-def in_sight(candidates: Candidates, sensor_z: float) -> Candidates:
+def in_sight(candidates: Candidates) -> Candidates:
     """Candidates below the sensor to which no ray passes below a nearer one beside it.
 
     Mirror images may be the lowest returns of most cells: a plane through these is that of a
     ceiling, or of nothing.
     """
-    slope = slope_of_sight(candidates.r, candidates.z, sensor_z)
+    slope = slope_of_sight(candidates.r, candidates.z)
     shape = candidates.n_segments, int(candidates.bin.max(initial=0)) + 1
     cell = candidates.segment * shape[1] + candidates.bin
     tells = np.flatnonzero((candidates.r >= NEAREST) & (slope < 0.0))
@@ -138,36 +134,9 @@ def in_sight(candidates: Candidates, sensor_z: float) -> Candidates:
     return candidates.where((slope < 0.0) & (slope >= nearer))
 
 
-@shared
-def is_on_plane(r: Values, z: Values, plane_z: float) -> Values:
-    """Whether returns are of the ground that tells images."""
-    return (r >= NEAREST) & (np.abs(z - plane_z) <= tolerance_at(r))
-
-
-@shared
-def slope_of_sight(r: Values, z: Values, sensor_z: float) -> Values:
-    """Slope of the line of sight to a return at a range and a height [m]."""
-    return (z - sensor_z) / np.maximum(r, NEAREST)
-
-
-@shared
-def is_image(
-    r: Values,
-    z: Values,
-    slope: Values,
-    nearer: Values,
-    plane_z: float,
-    sensor_z: float,
-    least: float,
-) -> Values:
-    """Whether a return is deep, and `least` below the line of sight to ground that is nearer.
-
-    `slope` and `nearer` are the slopes of the lines of sight to it and to that ground, -inf where
-    there is none; `least` is measured at the plane [m].
-    """
-    # Only a line of sight that points down meets the plane: at its height over its slope.
-    may_be = (z < plane_z - DEEP) & (r >= NEAREST) & (r < IMAGE_REACH) & (nearer < 0.0)
-    return may_be & ((nearer - slope) * (sensor_z - plane_z) > -least * nearer)
+def slope_of_sight(r: FloatArray, z: FloatArray) -> FloatArray:
+    """Slope of the line of sight to returns at a range and a height [m]."""
+    return np.asarray(z / np.maximum(r, NEAREST))
 
 
 def _nearer_about(
