@@ -39,9 +39,9 @@ def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicl
     mounts = (0.6, 0.0, 0.6), (0.15, 0.0, 0.15), *((1.73, z, reference) for z in (0.0, 1.53, 1.73))
     for height, lift, expected in mounts:
         pose = pose_of(moved(scan_of('kerb', SMALL_VLP, height).points, lift))
-        found = low_sensor.sensor_height_of(pose, config.sensor)
+        found = low_sensor.sensor_height_of(pose)
         assert found == pytest.approx(expected, abs=0.04)
-        own, share = low_sensor.for_sensor(config, pose, config.sensor), expected / reference
+        own, share = low_sensor.for_sensor(config, pose), expected / reference
         if share == 1.0:
             assert own is config
             continue
@@ -51,19 +51,18 @@ def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicl
         assert own.label.ground_tolerance == pytest.approx(least, abs=0.005)
         # A smaller one that is given stays, and the paper's rule knows no height of the sensor.
         fine = config.replace(**{'label.ground_tolerance': 0.02})
-        assert low_sensor.for_sensor(fine, pose, fine.sensor).label.ground_tolerance == 0.02
+        assert low_sensor.for_sensor(fine, pose).label.ground_tolerance == 0.02
         paper = config.replace(**{'label.rule': 'tolerance'})
-        assert low_sensor.for_sensor(paper, pose, paper.sensor) is paper
+        assert low_sensor.for_sensor(paper, pose) is paper
         # What is at its least already is not refused.
         names = (*GATES, 'label.ground_tolerance')
         tiny = config.replace(**{name: find_spec(name).minimum for name in names})
-        assert low_sensor.for_sensor(tiny, pose, tiny.sensor) == tiny
+        assert low_sensor.for_sensor(tiny, pose) == tiny
     # The sensor is where the origin is given to be.
     points = moved(scan_of('kerb', SMALL_VLP, 0.15).points, 0.15)
-    given = dataclasses.replace(config.sensor, origin_z=0.15)
     pose = pose_of(points, origin_z=0.15)
-    assert low_sensor.sensor_height_of(pose, given) == pytest.approx(0.15, abs=0.04)
-    assert low_sensor.sensor_height_of(pose_of(points), config.sensor) == reference
+    assert low_sensor.sensor_height_of(pose) == pytest.approx(0.15, abs=0.04)
+    assert low_sensor.sensor_height_of(pose_of(points)) == reference
 
 
 def desks(gap):

@@ -65,8 +65,8 @@ to 0.02 in crowded rooms and corridors, 0.03 to 0.15 where the ground was cut aw
 CUT_TILT = 0.08
 """Tilt [rad] from which a plane is not that at which ground was cut away."""
 LOWER_ENDS = (
-    'the lowest returns are the lower ends of objects: was the ground cut away before, by a crop '
-    'box or a pass-through filter?'
+    'the lowest returns are the lower ends of objects: the ground is not seen, or was cut away '
+    'before, by a crop box or a pass-through filter'
 )
 FAR_OFF, TINY, HUGE = 10.0, 0.5, 200.0
 """Range of the nearest hundredth of the returns [m] from which the origin is not the sensor. Range
@@ -186,9 +186,9 @@ def clearest(below: View | None, others: Iterable[View]) -> View | None:
 @np.errstate(invalid='ignore', over='ignore')
 def objection_to_ground(scan: Scan, view: View | None) -> str:
     """Return why a scan that shows this plane, or none, has no ground, or ''."""
-    is_level = view is not None and view.plane.normal[2] >= math.cos(CUT_TILT)
-    if is_level and _shows_lower_ends(view.plane, scan):
-        return LOWER_ENDS
+    if view is not None and view.turn is UPRIGHT and view.plane.normal[2] >= math.cos(CUT_TILT):
+        if _shows_lower_ends(view.plane, scan):
+            return LOWER_ENDS
     r = scan.grid.r[np.isfinite(scan.grid.r)]
     if len(r) == 0 or (view is not None and view.is_surface):
         return ''
@@ -218,12 +218,8 @@ def _shows_lower_ends(plane: GroundPlane, scan: Scan) -> bool:
     alone = height[~has_next[tile]]
     if len(tile) - len(alone) <= enough:
         return False
-    scatter = [
-        np.subtract(*np.quantile(heights, (0.75, 0.25)))
-        for heights in (height, alone)
-        if len(heights) >= MIN_CELLS
-    ]
-    return bool(min(scatter) > FLOOR_SCATTER)
+    scatter = [np.subtract(*np.quantile(z, (0.75, 0.25))) for z in (height, alone) if len(z) > 3]
+    return bool(min(scatter, default=np.inf) > FLOOR_SCATTER)
 
 
 def refusal(view: View, given: FloatArray) -> str:

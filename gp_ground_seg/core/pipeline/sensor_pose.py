@@ -182,7 +182,7 @@ def estimate_pose(
         contradictions = (refusal(elsewhere, given.rotation),)
         if AUTO in (sensor.roll, sensor.pitch):
             raise PointCloudError(*contradictions)
-    doubts = (objection,) if objection else ()
+    doubts = (objection,) if objection and sensor.height == AUTO else ()
     if view is None:
         return dataclasses.replace(given, contradictions=contradictions, doubts=doubts)
     plane, tells_height, tells_tilt = view.plane, view.tells_height, view.tells_tilt
