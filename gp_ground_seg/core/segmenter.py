@@ -37,7 +37,6 @@ from gp_ground_seg.core.pipeline.ground_view import (
 )
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
 from gp_ground_seg.core.pipeline.mirror_images import (
-    MAYBE_MIRRORED,
     MIRRORED,
     MirrorImages,
     find_mirror_images,
@@ -271,7 +270,8 @@ class GroundSegmenter:
         if objection == LOWER_ENDS and pose.is_height_default:
             nothing = np.zeros(len(scan.candidates.r), dtype=np.bool_)
             scan = scan._replace(candidates=scan.candidates.where(nothing))
-        images = find_mirror_images(scan, pose)
+        is_dry = below is not None and not (below.is_mirror or below.may_be_image)
+        images = MirrorImages.none() if is_dry else find_mirror_images(scan, pose)
         if len(images.points) > 0:
             scan = images.left_out(backend.build_grid(images.raised(scan.xyz), config))
         timer.mark('pose')
@@ -283,9 +283,8 @@ class GroundSegmenter:
         Else `below`, and the scan as it is.
         """
         if below is not None:
-            share = mirror_share(below.plane, scan)
-            below = below._replace(is_mirror=share >= MIRRORED)
-            if share < MAYBE_MIRRORED and not below.may_be_image:
+            below = below._replace(is_mirror=mirror_share(below.plane, scan) >= MIRRORED)
+            if not (below.is_mirror or below.may_be_image):
                 return below, scan
         left = scan._replace(candidates=in_sight(scan.candidates))
         view = self._look(left)

@@ -186,11 +186,11 @@ def clearest(below: View | None, others: Iterable[View]) -> View | None:
 @np.errstate(invalid='ignore', over='ignore')
 def objection_to_ground(scan: Scan, view: View | None) -> str:
     """Return why a scan that shows this plane, or none, has no ground, or ''."""
-    if view is not None and view.turn is UPRIGHT and view.plane.normal[2] >= math.cos(CUT_TILT):
-        if _shows_lower_ends(view.plane, scan):
-            return LOWER_ENDS
-    r = scan.grid.r[np.isfinite(scan.grid.r)]
-    if len(r) == 0 or (view is not None and view.is_surface):
+    if view is not None and view.turn is UPRIGHT and _shows_lower_ends(view.plane, scan):
+        return LOWER_ENDS
+    r = scan.grid.r if view is None or not view.is_surface else scan.grid.r[:0]
+    r = r[np.isfinite(r)]
+    if len(r) == 0:
         return ''
     nearest, middle, farthest = np.quantile(r, (0.01, 0.5, 0.99)).tolist()
     if farthest < TINY or (middle > HUGE and farthest > FAR_OFF * nearest):
@@ -205,12 +205,15 @@ def objection_to_ground(scan: Scan, view: View | None) -> str:
 
 def _shows_lower_ends(plane: GroundPlane, scan: Scan) -> bool:
     """Whether most of what lies on a plane is lower ends of columns, and the rest is no floor."""
+    if plane.normal[2] < math.cos(CUT_TILT):
+        return False
     candidates, tiles = scan.candidates, scan.tiles
     height = plane.below(candidates.x, candidates.y, candidates.z)
-    is_near = (np.abs(height) <= tolerance_at(candidates.r)) & (candidates.r < COLUMNS_REACH)
-    height, tile, (low, high) = height[is_near], as_index(candidates.tile[is_near]), COLUMN
+    tolerance = np.where(candidates.r < COLUMNS_REACH, tolerance_at(candidates.r), 0.0)
+    is_near, (low, high) = np.abs(height) < tolerance, COLUMN
+    height, tile = height[is_near], as_index(candidates.tile[is_near])
     enough = COLUMNS * len(tile)
-    if np.count_nonzero(np.diff(tiles.extremes[tile]) > low) <= enough:
+    if np.count_nonzero((tiles.extremes[:, 1] - tiles.extremes[:, 0])[tile] > low) <= enough:
         return False
     over = plane.below(*scan.xyz.T)
     has_next = np.zeros(len(tiles.extremes), dtype=np.bool_)

@@ -40,10 +40,9 @@ WET_SHARE, WET_REACH = 0.1, 20.0
 asked for what they are images of."""
 COUNTERPART = 0.2
 """Distance of a raised image to what it is an image of, at most about this [m]."""
-MIRRORED, MAYBE_MIRRORED = 0.4, 0.12
+MIRRORED = 0.4
 """Share of what is deep below a plane that has a counterpart over it, from which the plane is a
-mirror, and from which there may be one nearby: of dry scans outdoors the most was 0.22, of wet
-ones 0.45 to 0.88, and 0.13 to 0.35 with a plane that is off."""
+mirror: of dry scans outdoors the most was 0.22, of wet ones 0.45 to 0.88."""
 
 
 class MirrorImages(NamedTuple):
@@ -51,6 +50,11 @@ class MirrorImages(NamedTuple):
 
     points: IntArray  # (I,) indices
     rise: FloatArray  # (I,) [m]
+
+    @classmethod
+    def none(cls) -> MirrorImages:
+        """No return is one."""
+        return cls(np.zeros(0, dtype=np.int64), np.zeros(0))
 
     def raised(self, xyz: PointArray) -> PointArray:
         """Points (N, 3), each image where what it is an image of is."""
@@ -73,12 +77,10 @@ def find_mirror_images(scan: Scan, pose: SensorPose) -> MirrorImages:
     An image is deep below the plane, and hardly above the line of sight to ground that is seen
     nearer. Where rays start must be known, or nothing is told.
     """
-    none = MirrorImages(np.zeros(0, dtype=np.int64), np.zeros(0))
     grid, plane_z = scan.grid, -pose.sensor_height
-    if not (is_seen_from_sensor(pose) and plane_z < 0.0):
-        return none
-    if mirror_share(GroundPlane(pose.sensor_height), scan) < MIRRORED:
-        return none
+    is_known = is_seen_from_sensor(pose) and plane_z < 0.0
+    if not is_known or mirror_share(GroundPlane(pose.sensor_height), scan) < MIRRORED:
+        return MirrorImages.none()
     inside = np.flatnonzero(grid.inside)
     r, z = grid.r[inside].astype(np.float64), scan.xyz[inside, 2].astype(np.float64)
     slope, cell = slope_of_sight(r, z), grid.cell[inside].astype(np.int64)
@@ -100,14 +102,18 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     of it. What is seen of a valley, or below a table or a dock, meets none.
     """
     candidates = scan.candidates
-    near = np.flatnonzero((candidates.r >= NEAREST) & (candidates.r < WET_REACH))
-    place = np.column_stack([candidates.x, candidates.y, candidates.z])[near]
-    over, tolerance = plane.below(*place.T), tolerance_at(candidates.r[near])
-    deep = over < -DEEP
-    if np.count_nonzero(deep) <= WET_SHARE * np.count_nonzero(np.abs(over) <= tolerance):
+    over = plane.below(candidates.x, candidates.y, candidates.z)
+    near = (candidates.r >= NEAREST) & (candidates.r < WET_REACH)
+    deep = np.flatnonzero(near & (over < -DEEP))
+    is_on_it = near & (np.abs(over) <= tolerance_at(candidates.r))
+    if len(deep) <= WET_SHARE * np.count_nonzero(is_on_it):
         return 0.0
-    normal = np.array(plane.normal)
-    raised = place[deep] - (2.0 * over[deep] * normal[2])[:, None] * normal
+    place = np.column_stack([candidates.x[deep], candidates.y[deep], candidates.z[deep]])
+    normal, tile = np.array(plane.normal), candidates.tile[deep]
+    raised = place - (2.0 * over[deep] * normal[2])[:, None] * normal
+    # A valley has little above it that is as high: no need to look closer.
+    if np.mean(scan.tiles.extremes[tile, 1] > raised[:, 2] - COUNTERPART) < MIRRORED:
+        return 0.0
     # Boxes with a return, and a margin of one on all sides.
     low = raised.min(axis=0) - 2.0 * COUNTERPART
     shape = ((raised.max(axis=0) - low) / COUNTERPART).astype(np.int64) + 3
