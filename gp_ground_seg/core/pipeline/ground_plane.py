@@ -58,6 +58,9 @@ OTHER_SHARE = 0.2
 top of a dock only the nearest rings are seen."""
 CLEAN = 0.5
 """Share of the support in all evidence from which a level is not refuted."""
+TIGHT = 0.8
+"""Support of a level over the weights of all points within the tolerance of it: two thirds if
+their heights are any within it."""
 ASIDE = 0.6
 """Length of the mean of the directions in which a level is seen, from which it lies on one side of
 the robot: it is 0.64 of what fills a half-plane. The mean direction of all that is seen is taken
@@ -277,7 +280,7 @@ def own_level(cells: LowestPoints, n: int, max_slope: float) -> tuple[bool, Plan
     is_over = is_parallel & (height > 0.0) & (height < best[0] - APART)
     levels = np.where(is_over, supports, 0.0)
     over, over_score, support = best_of(planes, levels, cells, n, OTHER_SHARE * score)
-    if over_score > CLEAN * support and is_around(cells, n, over, best):
+    if over_score > CLEAN * support and is_around(cells, n, over, best, support):
         return True, over, best[0]
     levels = np.where(is_parallel & (height > best[0] + APART), supports, 0.0)
     under, under_score, _ = best_of(planes, levels, cells, n, OTHER_SHARE * score)
@@ -304,12 +307,13 @@ def hypotheses(cells: LowestPoints, n: int, max_slope: float) -> FloatArray:
 
 
 @shared
-def is_around(cells: LowestPoints, n: int, over: Plane, best: Plane) -> bool:
+def is_around(cells: LowestPoints, n: int, over: Plane, best: Plane, support: float) -> bool:
     """Whether a level over another one lies on all sides, nearer than the other.
 
-    It reaches farther than the own body of the robot.
+    It reaches farther than the own body of the robot, and its `support` is that of one level, not
+    of cars of many heights.
     """
-    x = y = seen_x = seen_y = reach = told = told_other = 0.0
+    x = y = seen_x = seen_y = reach = told = told_other = whole = 0.0
     n_over, n_seen, last, last_told = 0, 0, -1, -1
     for c in range(n):
         # Cells come sector by sector, from near to far.
@@ -320,7 +324,8 @@ def is_around(cells: LowestPoints, n: int, over: Plane, best: Plane) -> bool:
             seen_x, seen_y = seen_x + cosine, seen_y + sine
         height = distance(cells.x[c], cells.y[c], cells.z[c], over)
         is_on_it = abs(height) <= cells.tolerance[c]
-        reach = max(reach, r) if is_on_it else reach
+        if is_on_it:
+            reach, whole = max(reach, r), whole + cells.weight[c]
         is_on_other = abs(distance(cells.x[c], cells.y[c], cells.z[c], best)) <= cells.tolerance[c]
         if sector != last_told and (is_on_it or is_on_other):
             last_told = sector
@@ -329,7 +334,8 @@ def is_around(cells: LowestPoints, n: int, over: Plane, best: Plane) -> bool:
                 n_over, x, y, told = n_over + 1, x + cosine, y + sine, told + weight
             else:
                 told_other += weight
-    if n_over == 0 or reach < BODY_REACH or told <= told_other:
+    is_one_level = support >= TIGHT * RESOLUTION * whole
+    if n_over == 0 or reach < BODY_REACH or told <= told_other or not is_one_level:
         return False
     return math.hypot(x / n_over - seen_x / n_seen, y / n_over - seen_y / n_seen) < ASIDE
 

@@ -64,6 +64,8 @@ FLOOR_SCATTER = 0.025
 to 0.02 in crowded rooms and corridors, 0.03 to 0.15 where the ground was cut away."""
 CUT_TILT = 0.08
 """Tilt [rad] from which a plane is not that at which ground was cut away."""
+FLOOR_SHARE = 0.1
+"""Share of all that these others are then, at least."""
 LOWER_ENDS = (
     'the lowest returns are the lower ends of objects: the ground is not seen, or was cut away '
     'before, by a crop box or a pass-through filter'
@@ -221,7 +223,8 @@ def _shows_lower_ends(plane: GroundPlane, scan: Scan) -> bool:
     alone = height[~has_next[tile]]
     if len(tile) - len(alone) <= enough:
         return False
-    scatter = [np.subtract(*np.quantile(z, (0.75, 0.25))) for z in (height, alone) if len(z) > 3]
+    floors = [z for z in (height, alone) if len(z) > FLOOR_SHARE * len(tile)]
+    scatter = [np.subtract(*np.quantile(z, (0.75, 0.25))) for z in floors]
     return bool(min(scatter, default=np.inf) > FLOOR_SCATTER)
 
 
