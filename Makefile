@@ -48,9 +48,9 @@ $(VENV)/.docs: setup.py $(VENV)/.dev
 demo: $(VENV)/.ros
 	$(BIN)/gp-ground-seg demo --force
 
-# A test that hangs fails after so many seconds, with a traceback. Two processes share the modules.
+# A test that hangs fails after so many seconds, with a traceback. Two processes share the modules:
+# one compiles at the first run, and the other goes on with tests that need no compiled code.
 test: $(VENV)/.dev
-	$(BIN)/gp-ground-seg warm-up
 	$(WITH_KITTI) $(BIN)/python -m pytest -n 2 --dist loadfile --timeout=300 -m 'not slow'
 
 # The slow ones run one after the other: some measure time and memory.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, Shutdown
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
@@ -57,6 +57,7 @@ def generate_launch_description():
         ros_arguments=['--params-file', given['params_file']],
         remappings=[('points', given['topic'])],
         output='screen',
+        on_exit=Shutdown(reason='the node has ended'),
         **of_both,
     )
     return LaunchDescription([*declared, rviz, node])

@@ -127,7 +127,9 @@ CASES |= {
     'capitals.pcd': (pcd(fields='X Y Z', data='binary', body=RAW), 'X Y Z'),
     'x_twice.pcd': (ring_pcd(rows(RING), name='x', data='binary'), 'x y z x_2'),
     'unknown_type.pcd': (ring_pcd(rows(RING), 'S'), 'field ring: no type S of 2 bytes'),
-    'word.pcd': (ring_pcd(with_ring(*'abcd')), 'x y z ring'),
+    'word.pcd': (ring_pcd(with_ring(*'abcd')), 'x y z'),
+    'word_as_x.pcd': (pcd(body=text_of(XYZ).replace(b'9.0', b'a')), "x: .* 'a' .* at row 3, "),
+    'word_as_z.pcd': (pcd(body=text_of(XYZ).replace(b'11.0', b'-')), "z: .* '-' .* at row 3, "),
     'empty_lines.pcd': (pcd(body=text_of(XYZ).replace(b'\n', b'\n\n') + b' \n'), 'x y z'),
     'byte_order_mark.pcd': (b'\xef\xbb\xbf# .PCD v0.7\n\n' + pcd(), 'x y z'),
     'crlf.pcd': (pcd().replace(b'\n', b'\r\n'), 'x y z'),
@@ -200,7 +202,8 @@ CASES |= {
     'nan_of_windows.ply': (
         ply(',float i', with_ring('-nan(ind)', '1.#QNAN', '-1.#IND', 3)), 'x y z i'
     ),
-    'word.ply': (ply(',float i', with_ring('a', 1, 2, 3)), 'x y z i'),
+    'word_as_y.ply': (ply(body=text_of(XYZ).replace(b'10.0', b'1,5')), "y: .* '1,5' .* row 3, "),
+    'word.ply': (ply(',float i', with_ring('a', 1, 2, 3)), 'x y z'),
     'crlf_binary.ply': (ply(body=b'', form=LE).replace(b'\n', b'\r\n') + RAW, 'x y z'),
     'umlaut.ply': (ply(',ushort höhe', rows(RING), LE), 'x y z höhe'),
     'latin1.ply': (ply().replace(b'made up', b'\xfcber'), 'x y z'),

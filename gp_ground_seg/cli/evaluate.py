@@ -15,7 +15,7 @@ from gp_ground_seg.core.errors import ConfigError, DataError, require, shown
 from gp_ground_seg.core.parameters.config import config_of
 from gp_ground_seg.core.parameters.schema import yaml_scalar
 from gp_ground_seg.data.files import staged_file
-from gp_ground_seg.data.inputs import Input, list_inputs
+from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame, is_root, labelled_frames
 from gp_ground_seg.lab.cluster import Runner
 from gp_ground_seg.lab.scoring import tables
@@ -164,12 +164,8 @@ def _items(arguments: argparse.Namespace, cut: float) -> tuple[Any, Callable[[An
     names = ('sequences', 'frame_step', 'cut', 'workers', 'scheduler')
     options.refuse(arguments, names, f'{root} has no sequences/*/velodyne below it')
     inputs = list_inputs(root, options.columns_of(arguments))
-    return inputs, partial(_load_cloud, inputs.path.stem)
-
-
-def _load_cloud(sequence: str, item: Input) -> KnownScan:
-    """Read a cloud without labels."""
-    return KnownScan(shown(sequence), shown(item.name), item.read().xyz)
+    name = shown(inputs.path.stem)
+    return inputs, lambda item: KnownScan(name, shown(item.name), item.read().xyz)
 
 
 def _result_lines(scores: Scores) -> list[str]:

@@ -246,7 +246,7 @@ class Segmentation:
         `pose` has no tilt, that is the sensor's own, and the height is ``z - ground_z``. The
         labels follow from ``labelled.height``, which is that over the uncorrected `surface`.
         """
-        return self.labelled.height - self._correction
+        return self.labelled.height - self._at_points(self.corrected.correction)
 
     @cached_property
     def ground_z(self) -> FloatArray:
@@ -273,10 +273,6 @@ class Segmentation:
         About `ground_z`: surface, roughness and range noise together. NaN without a model.
         """
         return self._at_points(self.corrected.return_std)
-
-    @cached_property
-    def _correction(self) -> FloatArray:
-        return self._at_points(self.corrected.correction)
 
     def _at_points(self, table: FloatArray) -> FloatArray:
         return at_points(self.surface.knots, table, self.grid)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import PointCloudError, log_once
+from gp_ground_seg.core.errors import PointCloudError, in_one_line, log_once
 
 Fields = npt.NDArray[np.void]
 Columns = dict[str, npt.NDArray[Any]]
@@ -24,6 +24,7 @@ MAX_NUMBERS = 1000
 """Most numbers of a point: the header of a file without points can name any number."""
 _MAX_HEADER_BYTES = 1 << 16
 _LONG = {'i8', 'u8'}
+_NAN_OF_WINDOWS = re.compile(rb'[-+]?(nan\(\w+\)|1\.#(QNAN|SNAN|IND)\w*)', re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -183,8 +184,8 @@ def read_table(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
 def read_lines(text: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
     """Read points of a text, one a line; PointCloudError if there are fewer than it should have.
 
-    Further words of a line are left out. What is no number is NaN, and an integer field that has
-    other numbers becomes float64.
+    Further words of a line are left out, as is a field beside x, y and z that has words. Integers
+    with other numbers among them become float64.
     """
     lines = [line for line in text.splitlines() if line.strip()][:n_points]
     if len(lines) < n_points:
@@ -199,14 +200,24 @@ def read_lines(text: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
         raise PointCloudError(
             f'a line of {n_words} words, its header says {wanted}, separated by spaces'
         )
-    table = np.genfromtxt(lines, comments='\n', usecols=range(wanted), encoding='latin-1')
+    lines = [_NAN_OF_WINDOWS.sub(b'nan', line) for line in lines]
     columns: Columns = {}
+    stop = 0
     for name in dtype.names or ():
         own, shape = dtype[name].base, dtype[name].shape
-        values, table = np.split(table.reshape(n_points, -1), [math.prod(shape)], axis=1)
-        columns[name] = values.astype(own).reshape(-1, *shape)
-        if own.kind != 'f' and (columns[name].reshape(values.shape) != values).any():
-            said = f'field {name}: has numbers that are no {own}; read as float64'
-            log_once(logging.INFO, said)
+        start, stop = stop, stop + math.prod(shape)
+        for kind in (own, np.dtype('f8')):
+            try:
+                values = np.loadtxt(lines, kind, None, usecols=range(start, stop), ndmin=2)
+            except (ValueError, TypeError) as error:
+                problem = in_one_line(error)
+                continue
             columns[name] = values.reshape(-1, *shape)
+            break
+        if name not in columns:
+            if name in 'xyzXYZ':
+                raise PointCloudError(f'field {name}: {problem} Row 0 is the first point')
+            log_once(logging.INFO, f'field {name}: has what is no number; left out')
+        elif kind != own:
+            log_once(logging.INFO, f'field {name}: has numbers that are no {own}; read as float64')
     return gather(columns)

@@ -57,14 +57,10 @@ class SequenceGaps:
     def __init__(self) -> None:
         self._last: list[int] = []  # of each publisher heard
 
-    def reset(self) -> None:
-        """Forget the last numbers, after the publishers have changed."""
-        self._last.clear()
-
     def note(self, number: int | None, n_publishers: int = 1) -> int:
         """Return how many messages are missing before the one with this `number`."""
         if number is None:
-            self.reset()
+            self._last.clear()
             return 0
         below = max((last for last in self._last if last < number), default=None)
         n_heard = len(self._last)
@@ -164,22 +160,18 @@ class CloudSubscription:
         n_lost = self._gaps.note(info.get('publication_sequence_number'), self.n_publishers)
         if n_lost and self._look_at_publishers():
             n_lost = 0  # the numbers are those of another publisher
-        if self._reliability == ReliabilityPolicy.BEST_EFFORT:
-            self._check_size(len(cloud.data))
+        if self._reliability == ReliabilityPolicy.BEST_EFFORT and len(cloud.data) > LARGE_CLOUD:
+            self._fault_of_size = (
+                f'clouds of {len(cloud.data) / 1e6:.1f} MB come best-effort, and Fast DDS may '
+                'lose most of them: let their publisher offer reliable, or start it with '
+                'FASTRTPS_DEFAULT_PROFILES_FILE=config/fastdds_large_clouds.xml'
+            )
+            self._node.get_logger().warning(f'on {self.topic}, {self._fault_of_size}', once=True)
         self._jumps.note(seconds_of(cloud.header.stamp))
         # Both are stamps of the system clock; 0 where the middleware gives none.
         now = time.time_ns()
         wait = max(0.0, 1e-9 * (now - (info.get('received_timestamp') or now)))
         self.callback(cloud, time.monotonic() - wait, n_lost)
-
-    def _check_size(self, size: int) -> None:
-        if size > LARGE_CLOUD:
-            self._fault_of_size = (
-                f'clouds of {size / 1e6:.1f} MB come best-effort, and Fast DDS may lose most of '
-                'them: let their publisher offer reliable, or start it with '
-                'FASTRTPS_DEFAULT_PROFILES_FILE=config/fastdds_large_clouds.xml'
-            )
-            self._node.get_logger().warning(f'on {self.topic}, {self._fault_of_size}', once=True)
 
     def _on_incompatible(self, _event: object) -> None:
         if self._is_pinned:
@@ -206,7 +198,7 @@ class CloudSubscription:
             self._node.get_logger().warning(f'on {self.topic}, {self._fault_of_types}')
         is_changed = self._offered.keys() != before
         if is_changed:
-            self._gaps.reset()
+            self._gaps = SequenceGaps()
         return is_changed
 
     def _every_second(self) -> None:
@@ -231,7 +223,7 @@ class CloudSubscription:
         if is_listening:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
-            self._gaps.reset()
+            self._gaps = SequenceGaps()
         self._reliability, self._fault_of_size = wanted, ''
         words = f'not listening to {self.topic}: {self.idle}'
         if not self.idle:

@@ -102,7 +102,7 @@ class Page:
 def inputs(tmp_path_factory):
     folder = tmp_path_factory.mktemp('inputs')
     (folder / 'scans').mkdir()
-    for k in range(3):
+    for k in range(2):
         scan(k, 300, 60).tofile(folder / f'scans/{k}.bin')
     np.save(folder / 'a.npy', scan(0, 300, 60))
     write_streets(folder / 'root', s00=1)
@@ -150,7 +150,7 @@ def test_each_call_that_writes_fails_in_turn(name, tmp_path, capsys):
     expected = content(whole)
     size = max(path.stat().st_size for path in whole.rglob('*'))
     faults = [(call, failing_call, k) for k, call in enumerate(calls)]
-    faults += [('write', files_of_at_most, size * k // 8) for k in range(8)]
+    faults += [('write', files_of_at_most, size * k // 4) for k in range(4)]
     for n, (call, fault, k) in enumerate(faults):
         folder, where = tmp_path / f'{n}', f'{call} {k}'
         folder.mkdir()

@@ -15,7 +15,7 @@ from gp_ground_seg.lab.scoring.objects import SHARES
 from gp_ground_seg.lab.scoring.report import records
 from gp_ground_seg.lab.scoring.tables import (
     COMPARED,
-    IOU,
+    MEASURES,
     clusters,
     difference_table,
     interval_note,
@@ -33,7 +33,7 @@ def sequences_of(*hits, of=100, n_frames=1):
 
 
 def text(ours, theirs):
-    return interval_text(scores_of(a=ours, b=theirs), 'b', IOU)
+    return interval_text(scores_of(a=ours, b=theirs), 'b', MEASURES['iou'])
 
 
 def interval(ours, theirs):
@@ -85,7 +85,9 @@ def test_rows_of_a_part_are_drawn_by_the_clusters_of_all_scans():
     nothing = dict.fromkeys(('tp', 'fn'), 0)
     emptied = [[{**row, **nothing} if row['sequence'] == '5' else row for row in its]
                for its in (ours, theirs)]  # fmt: skip
-    assert interval_text(scores, 'b', IOU, part) == text(*emptied) != text(ours, theirs)
+    assert (
+        interval_text(scores, 'b', MEASURES['iou'], part) == text(*emptied) != text(ours, theirs)
+    )
 
 
 def test_of_a_single_sequence_blocks_of_successive_frames_are_drawn():

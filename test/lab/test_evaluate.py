@@ -31,7 +31,7 @@ from gp_ground_seg.lab.scoring.evaluate import (
 )
 from gp_ground_seg.lab.scoring.metrics import COUNTS, label_ratios
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
-from gp_ground_seg.lab.scoring.tables import IOU
+from gp_ground_seg.lab.scoring.tables import MEASURES
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 METHODS = OURS, PATCHWORKPP
@@ -54,7 +54,7 @@ def test_pooling_sums_counts_and_does_not_average_ratios():
         y=[{'sequence': '08', 'index': '0', **small}, {'sequence': '00', 'index': '0', **small}],
     )
     assert (scores.methods, scores.sequences) == (['x', 'y'], ['08', '00'])
-    assert IOU(sums(scores.scans)).tolist() == [90 / 101, 0.0]
+    assert MEASURES['iou'](sums(scores.scans)).tolist() == [90 / 101, 0.0]
     by_sequence = sums(with_all(scores.scans), 'sequence')
     assert by_sequence.loc['y'].index.tolist() == ['08', '00', 'all']
     assert by_sequence.loc[('x', 'all'), 'tp'] == 90
@@ -214,7 +214,7 @@ def test_patchworkpp_on_real_frames_scores_as_measured_elsewhere(kitti):
     frames = [frame for frame in frames if int(frame.index) < 10]
     scores = runner.score_methods(frames, [PatchworkppMethod()])
     assert len(scores.scans) == 60
-    (iou,) = IOU(sums(scores.scans))
+    (iou,) = MEASURES['iou'](sums(scores.scans))
     assert iou == pytest.approx(0.9515, abs=0.001)
 
 

@@ -79,10 +79,9 @@ def everything(path):
 @pytest.mark.parametrize(
     ('line', 'more'),
     [
-        pytest.param('evaluate ROOT', '--workers 2', marks=pytest.mark.slow),
-        ('evaluate ROOT --peer patchworkpp', '--scheduler ADDRESS'),
+        pytest.param('evaluate ROOT --peer patchworkpp', '--workers 2', marks=pytest.mark.slow),
         ('experiment ablation ROOT', '--scheduler ADDRESS'),
-        ('experiment objects --sensors vlp-16 --scenes car_park --seeds 2', '--scheduler ADDRESS'),
+        ('experiment scenes --sensors vlp-16 --scenes car_park --seeds 1', '--scheduler ADDRESS'),
     ],
 )
 def test_reports_are_the_same_to_the_last_digit(line, more, root, scheduler, tmp_path, capsys):

@@ -71,3 +71,4 @@ def test_the_page_the_file_and_the_node_have_the_same_names(monkeypatch):
     names = [output.topic.replace('~', node['name']) for output in outputs]
     assert rviz['remappings'] == [(f'/{name}', name) for name in names]
     assert [topic for topic, _ in node['remappings']] == ['points']
+    assert node['on_exit'] is script.Shutdown.return_value

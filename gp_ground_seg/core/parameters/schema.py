@@ -435,8 +435,11 @@ def _unwrap_ros(document: object) -> tuple[Mapping[str, object], str]:
         return {}, ''
     if not isinstance(document, Mapping):
         raise ConfigError('must be a mapping of parameter groups')
-    if not _is_ros(document):
-        return document, ''
+    if not any(
+        str(key).startswith('/') or (isinstance(value, Mapping) and ROS_PARAMETERS_KEY in value)
+        for key, value in document.items()
+    ):
+        return document, ''  # bare groups
     if len(document) != 1:
         raise ConfigError(f'parameters of {len(document)} nodes; keep one, keyed {ROS_NODE_KEY}')
     ((node, below),) = document.items()
@@ -450,13 +453,6 @@ def _unwrap_ros(document: object) -> tuple[Mapping[str, object], str]:
         for key, value in below[ROS_PARAMETERS_KEY].items()
         if key not in OF_EVERY_NODE and not str(key).startswith('qos_overrides')
     }, str(node)
-
-
-def _is_ros(document: Mapping[str, object]) -> bool:
-    return any(
-        str(key).startswith('/') or (isinstance(value, Mapping) and ROS_PARAMETERS_KEY in value)
-        for key, value in document.items()
-    )
 
 
 def _flatten(tree: Mapping[str, object], prefix: str = '') -> Iterator[tuple[str, object]]:

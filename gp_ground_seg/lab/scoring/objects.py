@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, Label
+from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
 from gp_ground_seg.lab.scoring.metrics import Labels
 
 MIN_HEIGHT = 0.3
@@ -107,11 +107,6 @@ def _is_low(class_of: npt.NDArray[np.integer]) -> BoolArray:
     return class_of >= len(CLASSES) - len(LOW_CLASSES)
 
 
-def _medians(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
-    """Median of the values of each group; `ndimage` refuses none at all."""
-    return np.asarray(ndimage.median(values, group, range(n_groups)) if n_groups else values)
-
-
 def local_ground(
     points: npt.NDArray[np.floating], is_ground: BoolArray, wanted: BoolArray
 ) -> FloatArray:
@@ -132,7 +127,7 @@ def local_ground(
     places, number = np.unique(cell, return_inverse=True)
     if len(places) < N_CELLS:
         return result
-    height = _medians(ground[:, 2], number, len(places))
+    height = np.asarray(ndimage.median(ground[:, 2], number, range(len(places))))
     tree = KDTree((np.column_stack([places.real, places.imag]) + 0.5) * CELL_SIZE)
     distance, nearest = tree.query(xyz[wanted, :2], k=N_CELLS)
     median = np.median(height[nearest], axis=1)

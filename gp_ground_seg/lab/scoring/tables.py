@@ -45,7 +45,6 @@ MEASURES: dict[str, Measure] = {
     **metrics.HEIGHT_MEASURES,
 }
 """What is measured of sums over scans."""
-IOU = MEASURES['iou']
 HEIGHTS = 'without_model', 'bias', 'rmse', 'median_absolute', 'within_1', 'within_2'
 """Measures of the heights that are shown."""
 PEERS = (

@@ -2,7 +2,6 @@
 
 from gp_ground_seg.lab.simulation.objects import Kind, semantic_kitti_labels
 from gp_ground_seg.lab.simulation.scan import (
-    HDL_32E,
     HDL_64E,
     OS1_128,
     SENSORS,
@@ -11,6 +10,5 @@ from gp_ground_seg.lab.simulation.scan import (
 )
 from gp_ground_seg.lab.simulation.scenes import DRIVES, LOW, PLACES, SCENES, STEEP, Scene
 
-__all__ = ['DRIVES', 'HDL_32E', 'HDL_64E', 'LOW', 'OS1_128', 'PLACES', 'SCENES', 'SENSORS']
-__all__ += ['STEEP', 'VLP_16', 'Kind', 'Scene']
-__all__ += ['semantic_kitti_labels', 'simulate_scan']
+__all__ = ['DRIVES', 'HDL_64E', 'LOW', 'OS1_128', 'PLACES', 'SCENES', 'SENSORS']
+__all__ += ['STEEP', 'VLP_16', 'Kind', 'Scene', 'semantic_kitti_labels', 'simulate_scan']

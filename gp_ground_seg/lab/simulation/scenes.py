@@ -401,15 +401,10 @@ def _low_box(rng: np.random.Generator) -> tuple[Kind, objects.Size]:
     return Kind.BOX, (length, width, float(rng.choice(LOW_HEIGHTS)))
 
 
-def _lying_person(rng: np.random.Generator) -> tuple[Kind, objects.Size]:
-    """Person who lies on the ground."""
-    return Kind.PERSON, (1.7, 0.45, 0.22)
-
-
 _LOW_OBJECTS: dict[str, tuple[Callable[[np.random.Generator], tuple[Kind, objects.Size]], str]] = {
     'low_boxes': (_low_box, 'flat'),
     'low_boxes_rough': (_low_box, 'rough'),
-    'lying_persons': (_lying_person, 'flat'),
+    'lying_persons': (lambda rng: (Kind.PERSON, (1.7, 0.45, 0.22)), 'flat'),
 }
 
 
@@ -429,8 +424,7 @@ def _low_scene(name: str, seed: int) -> Scene:
             return Scene(name, terrain, tuple(solids))
         middle, away = bearing + half, near + 0.5 * (length * sin + width * cos)
         x, y, yaw = away * math.cos(middle), away * math.sin(middle), middle + 0.5 * math.pi
-        size = length, width, height
-        box = objects.standing_box(terrain, x, y, size, yaw + turned, kind)
+        box = objects.standing_box(terrain, x, y, (length, width, height), yaw + turned, kind)
         solids += objects.parts_of(x, y, [box])
         bearing += 2.0 * half + LOW_GAP
 
@@ -440,21 +434,22 @@ DRIVES: dict[str, Callable[[int], Scene]] = {
     'urban': _urban,
 }
 """Scenes whose lane along x is free, by name: seed -> scene."""
-_CROWDED = {
-    'traffic_jam': _traffic_jam,
-    'car_park': _car_park,
-    'hidden_climb': _hidden_climb,
-    'wet_road': _wet_road,
-    'blind_slope': _blind_slope,
-    'hedge': _hedge,
-}
 LOW: dict[str, Callable[[int], Scene]] = {
     name: functools.partial(_low_scene, name) for name in _LOW_OBJECTS
 }
 """Scenes of low objects."""
 STEEP = {'hills': _hills, 'valley': _valley, 'bank': _bank, 'on_ramp': _on_ramp, 'dike': _dike}
 """Scenes of steep ground."""
-PLACES = {**_CROWDED, **LOW, **STEEP}
+PLACES = {
+    'traffic_jam': _traffic_jam,
+    'car_park': _car_park,
+    'hidden_climb': _hidden_climb,
+    'wet_road': _wet_road,
+    'blind_slope': _blind_slope,
+    'hedge': _hedge,
+    **LOW,
+    **STEEP,
+}
 """All scenes around a sensor at the origin."""
 SCENES = {**DRIVES, **PLACES}
 """All scenes by name."""
