@@ -49,7 +49,8 @@ def test_ground_model_gives_the_height_anywhere(b):
     origin = {'sensor.origin_x': 1.5, 'sensor.origin_y': -0.5, 'sensor.origin_z': 1.0}
     points = street(6000)
     turned = xyz_of(points).astype(np.float64) @ rotation(*tilt.values())
-    points, tilt = ros.moved(points, turned + [*origin.values()]), tilt | origin
+    points = ros.moved(points, turned + np.array([*origin.values()]))
+    tilt |= origin
     message = to_message(points, stamp=(17, 23), frame='velo_link')
     with b.changed(tilt):
         found = received(b, '~/ground_model', message)
