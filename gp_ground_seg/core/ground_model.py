@@ -67,11 +67,6 @@ class GroundModel:
         tables = surface.knots, surface.mean, surface.std, length_scale
         return cls(*tables, pose.roll, pose.pitch, pose.origin)
 
-    @property
-    def is_level(self) -> bool:
-        """Whether z of the scan's frame is up."""
-        return self.roll == 0.0 and self.pitch == 0.0
-
     @usual_errors()
     def knot_points(self) -> FloatArray:
         """Place of every knot in the middle of its segment, frame of the scan, (M, K, 3) [m].
@@ -149,16 +144,13 @@ class GroundModel:
         finite = np.isfinite(x) & np.isfinite(y)
         shift_x, shift_y, lift = self.origin
         x, y = np.where(finite, x - shift_x, np.nan), np.where(finite, y - shift_y, np.nan)
-        if self.is_level:
-            z, std = self._over_level(x, y)
-            return z + lift, std
         matrix, z, std = rotation(self.roll, self.pitch), *np.full((2, *x.shape), np.nan)
         if abs(matrix[2, 2]) < STEEPEST:
             return z, std
         known = self.height[np.isfinite(self.height)]
         start = float(np.median(known)) if len(known) else 0.0
         z = (start - matrix[2, 0] * x - matrix[2, 1] * y) / matrix[2, 2]
-        for _ in range(N_ITERATIONS):
+        for _ in range(N_ITERATIONS if self.roll or self.pitch else 1):
             level = np.stack([x, y, z], axis=-1) @ matrix.T
             height, std = self._over_level(level[..., 0], level[..., 1])
             z = z + (height - level[..., 2]) / matrix[2, 2]

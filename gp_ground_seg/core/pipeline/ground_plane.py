@@ -231,10 +231,10 @@ def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
 @shared
 def fit_cells(cells: LowestPoints, n: int, max_slope: float) -> GroundPlane:
     """Fit a plane to the first `n` points."""
-    is_found, best, other = False, (0.0, 0.0, 0.0), math.nan
-    if n >= MIN_CELLS:
-        is_found, best, other = own_level(cells, n, max_slope)
-    if not is_found:
+    if n < MIN_CELLS:
+        return NO_PLANE
+    best, score, other = own_level(cells, n, max_slope)
+    if score <= 0.0:
         return NO_PLANE
     plane = refined(cells, best)
     if not is_possible(plane, LOOSER * max_slope):
@@ -259,8 +259,8 @@ SPREAD = _spread(N_TRIPLES)
 
 
 @shared
-def own_level(cells: LowestPoints, n: int, max_slope: float) -> tuple[bool, Plane, float]:
-    """Plane of the level that the robot stands on, whether there is one, and another's height.
+def own_level(cells: LowestPoints, n: int, max_slope: float) -> tuple[Plane, float, float]:
+    """Plane of the level that the robot stands on, its score or 0, and another's height or NaN.
 
     It is the plane with the best score, or a parallel one over it that is not refuted and lies
     around the robot: the top of a dock, of which less is seen than of what lies below it.
@@ -269,7 +269,7 @@ def own_level(cells: LowestPoints, n: int, max_slope: float) -> tuple[bool, Plan
     supports = supports_of(planes, cells)
     best, score, _ = best_of(planes, supports, cells, n, 0.0)
     if score <= 0.0:
-        return False, best, math.nan
+        return best, 0.0, math.nan
     height, slope_x, slope_y = planes[:, 0], planes[:, 1], planes[:, 2]
     if 0.0 < math.hypot(best[1], best[2]) < STRAIGHT:
         levels = np.where(np.hypot(slope_x, slope_y) == 0.0, supports, 0.0)
@@ -281,12 +281,11 @@ def own_level(cells: LowestPoints, n: int, max_slope: float) -> tuple[bool, Plan
     levels = np.where(is_over, supports, 0.0)
     over, over_score, support = best_of(planes, levels, cells, n, OTHER_SHARE * score)
     if over_score > CLEAN * support and is_around(cells, n, over, best, support):
-        return True, over, best[0]
+        return over, over_score, best[0]
     levels = np.where(is_parallel & (height > best[0] + APART), supports, 0.0)
     under, under_score, _ = best_of(planes, levels, cells, n, OTHER_SHARE * score)
-    if over_score > under_score:
-        return True, best, over[0]
-    return True, best, under[0] if under_score > 0.0 else math.nan
+    other = over if over_score > under_score else under
+    return best, score, other[0] if max(over_score, under_score) > 0.0 else math.nan
 
 
 @shared

@@ -67,6 +67,8 @@ class MeasuredPose:
     tells_tilt: bool  # the same for the tilt
     # in the frame levelled by the angles given, or where that is far from level in its own
     plane: GroundPlane
+    # as `height`, over another level that is seen, higher or lower; NaN if there is none [m]
+    other_height: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -196,7 +198,8 @@ def estimate_pose(
         roll, pitch = given.roll, given.pitch
     height = plane.near_height * plane.normal[2] / along
     height = rounded(height - _product(vertical(roll, pitch), given.origin))
-    measured = MeasuredPose(height, *angles_of(up), tells_height, tells_tilt, plane)
+    other = height + plane.other_height - plane.near_height
+    measured = MeasuredPose(height, *angles_of(up), tells_height, tells_tilt, plane, other)
     estimates_height = sensor.height == AUTO and tells_height
     return dataclasses.replace(
         given,
@@ -261,10 +264,9 @@ def _contradictions(sensor: SensorConfig, measured: MeasuredPose, view: View) ->
     """Say which parameters are clearly wrong: another level that is seen as well may be meant."""
     found = []
     if view.is_surface and view.is_well_supported and sensor.height != AUTO:
-        lift = measured.height - view.plane.near_height
         most = max(HEIGHT_CONTRADICTION, 0.1 * abs(sensor.height))
-        heights = (measured.height, view.plane.other_height + lift)
-        if not any(abs(sensor.height - height) <= most for height in heights):
+        seen = (measured.height, measured.other_height)
+        if not any(abs(sensor.height - height) <= most for height in seen):
             side = 'below' if measured.height >= 0.0 else 'above'
             found.append(
                 f'sensor.height = {sensor.height:g}: the ground near the sensor is '
