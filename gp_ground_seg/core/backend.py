@@ -13,7 +13,6 @@ from gp_ground_seg.core.pipeline import (
     ground_plane,
     labels,
     lines,
-    mirror_images,
     polar_grid,
     relief,
     vertical_faces,
@@ -32,7 +31,6 @@ class NumpyBackend:
     name = 'numpy'
     build_grid = staticmethod(polar_grid.build_scan)
     fit_plane = staticmethod(ground_plane.fit_plane)
-    is_wet = staticmethod(mirror_images.is_wet)
     find_faces = staticmethod(vertical_faces.find_faces)
     find_relief = staticmethod(relief.find_relief)
     extract_lines = staticmethod(lines.find_lines)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import FloatArray, IntArray, PointArray, usual_errors
-from gp_ground_seg.core.pipeline.points import rotation
+from gp_ground_seg.core.pipeline.points import Direction, rotation
 from gp_ground_seg.core.result import Segmentation
 
 N_ITERATIONS = 12
@@ -45,6 +45,8 @@ class GroundModel:
         a ground candidate of their own.
     roll, pitch : float
         Tilt of the frame of the scan: angles that make it level [rad].
+    origin : tuple of float
+        Place of the sensor in the frame of the scan [m].
     """
 
     knots: FloatArray
@@ -53,6 +55,7 @@ class GroundModel:
     length_scale: FloatArray
     roll: float = 0.0
     pitch: float = 0.0
+    origin: Direction = (0.0, 0.0, 0.0)
 
     @classmethod
     @usual_errors()
@@ -61,12 +64,8 @@ class GroundModel:
         surface, pose = segmentation.corrected, segmentation.pose
         with np.errstate(over='ignore'):
             length_scale = np.exp(segmentation.log_length_scale)
-        return cls(surface.knots, surface.mean, surface.std, length_scale, pose.roll, pose.pitch)
-
-    @property
-    def is_level(self) -> bool:
-        """Whether z of the scan's frame is up."""
-        return self.roll == 0.0 and self.pitch == 0.0
+        tables = surface.knots, surface.mean, surface.std, length_scale
+        return cls(*tables, pose.roll, pose.pitch, pose.origin)
 
     @usual_errors()
     def knot_points(self) -> FloatArray:
@@ -79,7 +78,7 @@ class GroundModel:
         azimuth = 2.0 * np.pi * middle - np.pi
         along = (self.knots * np.cos(azimuth), self.knots * np.sin(azimuth), self.height)
         level = np.where(np.isfinite(self.height)[..., None], np.stack(along, axis=-1), np.nan)
-        return level if self.is_level else np.asarray(level @ rotation(self.roll, self.pitch))
+        return np.asarray(level @ rotation(self.roll, self.pitch) + self.origin)
 
     @classmethod
     @usual_errors()
@@ -100,11 +99,15 @@ class GroundModel:
                 'must have at least 1 segment and 2 knots'
             )
         numbers = {name: column.astype(np.float64) for name, column in columns.items()}
-        roll, pitch = (float(numbers[name][0, 0]) for name in ('roll', 'pitch'))
+        roll, pitch, *place = (
+            float(numbers[name][0, 0])
+            for name in ('roll', 'pitch', 'origin_x', 'origin_y', 'origin_z')
+        )
+        origin = place[0], place[1], place[2]
         with np.errstate(invalid='ignore'):
-            height = (points.astype(np.float64) @ rotation(roll, pitch).T)[..., 2]
+            height = ((points.astype(np.float64) - origin) @ rotation(roll, pitch).T)[..., 2]
         knots, rest = numbers['range'][0], (numbers['std'], numbers['length_scale'])
-        model = cls(knots, height, *rest, roll, pitch)
+        model = cls(knots, height, *rest, roll, pitch, origin)
         with np.errstate(invalid='ignore'):
             strays = np.abs(points - model.knot_points()).max(axis=-1)
         # Where x and y are NaN and z is not, so is the distance, and the knot is no near one.
@@ -139,20 +142,19 @@ class GroundModel:
         """
         x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
         finite = np.isfinite(x) & np.isfinite(y)
-        x, y = np.where(finite, x, np.nan), np.where(finite, y, np.nan)
-        if self.is_level:
-            return self._over_level(x, y)
+        shift_x, shift_y, lift = self.origin
+        x, y = np.where(finite, x - shift_x, np.nan), np.where(finite, y - shift_y, np.nan)
         matrix, z, std = rotation(self.roll, self.pitch), *np.full((2, *x.shape), np.nan)
         if abs(matrix[2, 2]) < STEEPEST:
             return z, std
         known = self.height[np.isfinite(self.height)]
         start = float(np.median(known)) if len(known) else 0.0
         z = (start - matrix[2, 0] * x - matrix[2, 1] * y) / matrix[2, 2]
-        for _ in range(N_ITERATIONS):
+        for _ in range(N_ITERATIONS if self.roll or self.pitch else 1):
             level = np.stack([x, y, z], axis=-1) @ matrix.T
             height, std = self._over_level(level[..., 0], level[..., 1])
             z = z + (height - level[..., 2]) / matrix[2, 2]
-        return z, std
+        return z + lift, std
 
     def _over_level(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Height and standard deviation at places of the level frame; NaN for those of NaN."""

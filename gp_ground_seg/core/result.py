@@ -140,8 +140,6 @@ class Segmentation:
         Height of each point in the sensor frame [m].
     slope_std : float
         ``observation.slope_std`` of the frame.
-    origin : (3,) float64
-        Where the sensor was, in the frame of the scan [m].
     """
 
     labelled: Labelled
@@ -156,7 +154,6 @@ class Segmentation:
     relief: Relief
     z: PointArray
     slope_std: float
-    origin: FloatArray
 
     @property
     def theta(self) -> FloatArray:

@@ -9,7 +9,7 @@ import math
 import os
 import textwrap
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from numbers import Real
 from pathlib import Path
 from time import perf_counter
@@ -24,16 +24,28 @@ from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_
 from gp_ground_seg.core.gp.learning import Learned
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.parameters.schema import NO_BOX
+from gp_ground_seg.core.pipeline.ground_view import (
+    LOWER_ENDS,
+    MAX_TILT,
+    OTHER_AXES,
+    UPRIGHT,
+    View,
+    clearest,
+    is_ceiling,
+    is_doubtful,
+    objection_to_ground,
+)
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
 from gp_ground_seg.core.pipeline.mirror_images import (
+    MIRRORED,
     MirrorImages,
     find_mirror_images,
     in_sight,
-    is_mirror,
+    mirror_share,
 )
 from gp_ground_seg.core.pipeline.points import (
     ENOUGH_POINTS,
-    Direction,
+    moved,
     rotate,
     take_points,
     without_box,
@@ -43,18 +55,7 @@ from gp_ground_seg.core.pipeline.sensor_pose import (
     SensorPose,
     estimate_pose,
     given_pose,
-    origin_of,
     with_fallback,
-)
-from gp_ground_seg.core.pipeline.up_axis import (
-    MAX_TILT,
-    OTHER_AXES,
-    UPRIGHT,
-    View,
-    clearest,
-    is_doubtful,
-    may_be_image,
-    view_of,
 )
 from gp_ground_seg.core.result import Segmentation
 
@@ -161,17 +162,19 @@ class GroundSegmenter:
         # 2. Sensor pose, from a plane through the candidates near the sensor: a tilted scan is
         #    levelled, mirror images are raised, and a low sensor has narrower gates.
         scan, pose, images = self._level(xyz, sensor, timer, fallback)
-        config = for_sensor(self._config, pose, sensor)
+        config = for_sensor(self._config, pose)
         # 3. Vertical faces: walls, fences, sides of cars.
         faces = backend.find_faces(scan, config)
         timer.mark('faces')
         # 4. Relief of the land. Lines along each segment, over it, without lowest points of faces
         #    with occluded base, and pseudo-inputs. The prior mean is the ground below the sensor.
-        relief, candidates = backend.find_relief(scan.candidates, faces, pose.height, config)
+        relief, candidates = backend.find_relief(
+            scan.candidates, faces, pose.sensor_height, config
+        )
         candidates, lines, pseudo, continues_line, in_face = backend.extract_lines(
             candidates, faces, config
         )
-        knots, prior_mean = scan.grid.edges, -pose.height
+        knots, prior_mean = scan.grid.edges, -pose.sensor_height
         frame = Frame(candidates, lines, pseudo, continues_line, in_face, knots, prior_mean)
         timer.mark('lines')
         # 5. Observation and latent process: hyper-parameters theta, inliers and surface.
@@ -197,7 +200,6 @@ class GroundSegmenter:
             relief=relief,
             z=xyz[:, 2].copy(),
             slope_std=config.observation.slope_std,
-            origin=np.array([sensor.origin_x, sensor.origin_y, sensor.origin_z]),
         )
 
     @property
@@ -244,76 +246,73 @@ class GroundSegmenter:
         timer: StageTimer,
         fallback: SensorPose | None,
     ) -> tuple[Scan, SensorPose, MirrorImages]:
-        """Scan in the level frame, with mirror images raised.
+        """Scan in the level frame, about the sensor, with mirror images raised.
 
         Its angles are those given, estimated or of `fallback`.
         """
         backend, config, given = self._backend, self._config, given_pose(sensor)
-        level = given.level(xyz)
+        about = moved(xyz, given.origin)
+        level, elsewhere = given.level(about), None
         scan = backend.build_grid(level, config)
         timer.mark('grid')
-        origin, elsewhere = origin_of(sensor), None
-        seen, below = scan, self._look(scan, UPRIGHT, origin)
-        if may_be_image(below):
-            seen, below = self._past_images(scan, below, origin)
-        view = below
-        if seen is scan and is_doubtful(below):
-            view = self._find_ground(level, below, origin)
+        below, seen = self._past_images(scan, self._look(scan))
+        view = self._find_ground(level, below) if is_doubtful(below) else below
         if view is not None and not view.can_level:
             # The scan will not be levelled: the ground that matters is about level.
             elsewhere = view if view.tells_tilt else None
-            view = self._look(seen, UPRIGHT, origin, CLEAR_TILT) or below
-        pose = estimate_pose(scan.candidates, sensor, view, elsewhere)
+            view = self._look(seen, max_tilt=CLEAR_TILT) or below
+        objection = objection_to_ground(scan, view)
+        pose = estimate_pose(sensor, None if objection else view, elsewhere, objection)
         if fallback is not None:
             pose = with_fallback(pose, fallback, sensor)
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
-            scan = backend.build_grid(pose.level(xyz), config)
-        images = find_mirror_images(scan, pose, sensor, backend.is_wet)
+            scan = backend.build_grid(pose.level(about), config)
+        if objection == LOWER_ENDS and pose.is_height_default:
+            nothing = np.zeros(len(scan.candidates.r), dtype=np.bool_)
+            scan = scan._replace(candidates=scan.candidates.where(nothing))
+        is_dry = below is not None and not (below.is_mirror or below.may_be_image)
+        images = MirrorImages.none() if is_dry else find_mirror_images(scan, pose)
         if len(images.points) > 0:
             scan = images.left_out(backend.build_grid(images.raised(scan.xyz), config))
         timer.mark('pose')
         return scan, pose, images
 
-    def _past_images(
-        self, scan: Scan, below: View | None, origin: Direction
-    ) -> tuple[Scan, View | None]:
-        """Scan of the candidates that are no mirror images, and their plane, if it is a mirror.
+    def _past_images(self, scan: Scan, below: View | None) -> tuple[View | None, Scan]:
+        """View of a mirror: by the candidates that are no images of it, if these show one.
 
-        Else the scan as it is, and the plane `below`.
+        Else `below`, and the scan as it is.
         """
-        left = scan._replace(candidates=in_sight(scan.candidates, origin[2]))
-        view = self._look(left, UPRIGHT, origin)
-        if view is None or not (view.tells_height and is_mirror(view.plane, scan, origin)):
-            return scan, below
-        return left, view
+        if below is not None:
+            below = below._replace(is_mirror=mirror_share(below.plane, scan) >= MIRRORED)
+            if not (below.is_mirror or below.may_be_image):
+                return below, scan
+        left = scan._replace(candidates=in_sight(scan.candidates))
+        view = self._look(left)
+        if view is not None and view.is_whole and mirror_share(view.plane, scan) >= MIRRORED:
+            return view._replace(is_mirror=True), left
+        return below, scan
 
     def _look(
-        self, scan: Scan, turn: FloatArray, origin: Direction, max_tilt: float = MAX_TILT
+        self, scan: Scan, turn: FloatArray = UPRIGHT, max_tilt: float = MAX_TILT
     ) -> View | None:
-        """Plane of a scan that `turn` has rotated; `origin` is where the sensor was before."""
-        x, y, z = (turn @ origin).tolist()
-        plane = self._backend.fit_plane(scan.candidates, math.tan(max_tilt), (x, y, z))
-        return None if plane is None else view_of(plane, scan, turn, (x, y, z))
+        """Plane of a scan that `turn` has rotated, unless it is a ceiling."""
+        plane = self._backend.fit_plane(scan.candidates, math.tan(max_tilt))
+        return None if plane is None or is_ceiling(plane, scan) else View(plane, turn)
 
-    def _views(
-        self, xyz: PointArray, turns: Iterable[FloatArray], origin: Direction
-    ) -> Iterator[View]:
-        """Plane of the points, rotated by each of `turns`, where there is one."""
-        for turn in turns:
-            scan = self._backend.build_grid(rotate(xyz, turn), self._config)
-            view = self._look(scan, turn, origin)
-            if view is not None:
-                yield view
-
-    def _find_ground(self, xyz: PointArray, below: View | None, origin: Direction) -> View | None:
+    def _find_ground(self, xyz: PointArray, below: View | None) -> View | None:
         """Plane of the ground, about z or another axis; that `below` z is doubtful."""
         sample = xyz[:: len(xyz) // ENOUGH_POINTS + 1]
+
+        def look(turn: FloatArray) -> View | None:
+            return self._look(self._backend.build_grid(rotate(sample, turn), self._config), turn)
+
         if below is not None and below.is_steep:
-            below = next(self._views(sample, [below.levelled], origin), below)
+            below = look(below.levelled) or below
         if not is_doubtful(below):
             return below
-        first = self._views(sample, OTHER_AXES, origin)
-        return clearest(below, self._views(sample, [view.levelled for view in first], origin))
+        first = [view for view in map(look, OTHER_AXES) if view is not None]
+        again = (look(view.levelled) for view in first)
+        return clearest(below, [view for view in again if view is not None])
 
 
 def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[float, ...]:

@@ -112,11 +112,12 @@ class SegmentedCloud:
         # What lies below the surface does not stand on it, and tells how deep a drop is.
         stands = (found.label == _OBSTACLE) & ~(found.labelled.height < 0.0)
         # Rays begin at the sensor, which is not the origin of a cloud in the frame of a vehicle.
+        origin = np.array(found.pose.origin)
         with np.errstate(over='ignore', invalid='ignore'):
-            xyz = (self.points - found.origin) @ found.pose.rotation.T
+            xyz = (self.points - origin) @ found.pose.rotation.T
         xyz[found.grid.cell == NOT_FINITE] = np.nan
         edges = find_edges(xyz, self.is_ground, stands, output.max_step_down)
-        return edges.points() @ found.pose.rotation + found.origin
+        return np.asarray(edges.points() @ found.pose.rotation + origin)
 
     def _in_plane(self, x: PointArray, y: PointArray, z: PointArray) -> Places:
         """Places of points of the cloud, (n,) each, as `places` gives them."""

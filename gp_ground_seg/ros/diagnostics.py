@@ -226,6 +226,7 @@ def _pose_values(pose: SensorPose) -> dict[str, str]:
         values[f'Sensor {name} ({unit})'] = f'{getattr(pose, name):.4f}'
         shown = getattr(seen, name) if is_shown else None
         values[f'Estimated {name} ({unit})'] = _digits(shown, '.4f')
+    values['Height over another level (m)'] = _digits(seen and seen.other_height, '.4f')
     return {**values, 'Taken from the scan': ' '.join(taken) or 'nothing'}
 
 
@@ -302,4 +303,4 @@ class Diagnostics:
 
 
 def _digits(value: float | None, form: str) -> str:
-    return 'unknown' if value is None else format(value, form)
+    return 'unknown' if value is None or value != value else format(value, form)

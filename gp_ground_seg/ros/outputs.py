@@ -34,7 +34,10 @@ from gp_ground_seg.ros.input import seconds_of
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
-MODEL_FIELDS = ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')
+MODEL_FIELDS = (
+    'x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch', 'origin_x', 'origin_y',
+    'origin_z',
+)  # fmt: skip
 """Fields of ``~/ground_model``, all float32 [m, rad]. The last three locate a place in the grid:
 the horizontal range of the knot in the level frame, and the angles, equal in all points, that turn
 the cloud's frame into the level one."""
@@ -94,7 +97,7 @@ def ground_model_cloud(segmented: SegmentedCloud) -> PointCloud2:
         points[..., 3] = model.std
         points[..., 4] = model.length_scale
         points[..., 5] = model.knots
-        points[..., 6:] = model.roll, model.pitch
+        points[..., 6:] = model.roll, model.pitch, *model.origin
     message = PointCloud2(
         header=segmented.cloud.header,
         height=n_segments,

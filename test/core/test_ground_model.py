@@ -14,6 +14,10 @@ from gp_ground_seg.core.frame import at_points
 from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.pipeline.points import rotation
 
+NAMES = (
+    'x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch', 'origin_x', 'origin_y',
+    'origin_z',
+)  # fmt: skip
 # No neighbours, so that segments without a model stay without one; r_min of 0 is the hard case.
 CONFIGS = [
     Config().replace(**{'learning.mode': 'fixed', **changes})
@@ -44,10 +48,9 @@ def columns_of(model, points=None, knots=None):
     points = model.knot_points() if points is None else points
     shape = points.shape[:2]
     rest = model.std, model.length_scale, model.knots if knots is None else knots
-    values = *points.transpose(2, 0, 1), *rest, model.roll, model.pitch
-    names = 'x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch'
+    values = *points.transpose(2, 0, 1), *rest, model.roll, model.pitch, *model.origin
     made = [np.broadcast_to(column, shape).astype(np.float32) for column in values]
-    return dict(zip(names, made, strict=True))
+    return dict(zip(NAMES, made, strict=True))
 
 
 def rounded(model):

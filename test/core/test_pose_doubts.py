@@ -19,8 +19,10 @@ from test_sensor_pose import (
 )
 
 from gp_ground_seg import Config
+from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.core.pipeline import low_sensor
+from gp_ground_seg.core.pipeline.ground_view import LOWER_ENDS
 from gp_ground_seg.core.pipeline.sensor_pose import (
     LITTLE_GROUND,
     LOW_GROUND,
@@ -39,9 +41,9 @@ def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicl
     mounts = (0.6, 0.0, 0.6), (0.15, 0.0, 0.15), *((1.73, z, reference) for z in (0.0, 1.53, 1.73))
     for height, lift, expected in mounts:
         pose = pose_of(moved(scan_of('kerb', SMALL_VLP, height).points, lift))
-        found = low_sensor.sensor_height_of(pose, config.sensor)
+        found = low_sensor.sensor_height_of(pose)
         assert found == pytest.approx(expected, abs=0.04)
-        own, share = low_sensor.for_sensor(config, pose, config.sensor), expected / reference
+        own, share = low_sensor.for_sensor(config, pose), expected / reference
         if share == 1.0:
             assert own is config
             continue
@@ -51,19 +53,18 @@ def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicl
         assert own.label.ground_tolerance == pytest.approx(least, abs=0.005)
         # A smaller one that is given stays, and the paper's rule knows no height of the sensor.
         fine = config.replace(**{'label.ground_tolerance': 0.02})
-        assert low_sensor.for_sensor(fine, pose, fine.sensor).label.ground_tolerance == 0.02
+        assert low_sensor.for_sensor(fine, pose).label.ground_tolerance == 0.02
         paper = config.replace(**{'label.rule': 'tolerance'})
-        assert low_sensor.for_sensor(paper, pose, paper.sensor) is paper
+        assert low_sensor.for_sensor(paper, pose) is paper
         # What is at its least already is not refused.
         names = (*GATES, 'label.ground_tolerance')
         tiny = config.replace(**{name: find_spec(name).minimum for name in names})
-        assert low_sensor.for_sensor(tiny, pose, tiny.sensor) == tiny
+        assert low_sensor.for_sensor(tiny, pose) == tiny
     # The sensor is where the origin is given to be.
     points = moved(scan_of('kerb', SMALL_VLP, 0.15).points, 0.15)
-    given = dataclasses.replace(config.sensor, origin_z=0.15)
     pose = pose_of(points, origin_z=0.15)
-    assert low_sensor.sensor_height_of(pose, given) == pytest.approx(0.15, abs=0.04)
-    assert low_sensor.sensor_height_of(pose_of(points), config.sensor) == reference
+    assert low_sensor.sensor_height_of(pose) == pytest.approx(0.15, abs=0.04)
+    assert low_sensor.sensor_height_of(pose_of(points)) == reference
 
 
 def desks(gap):
@@ -211,6 +212,70 @@ def test_a_given_level_that_is_seen_as_well_is_not_contradicted():
     points = level_above('dike', SMALL_HDL, 1.75)
     assert pose_of(points, height=1.75 + 1.5).contradictions == ()
     assert len(pose_of(points, height=1.75 + 0.75).contradictions) == 1
+
+
+@pytest.mark.parametrize(('edge', 'drop'), [(2.6, -1.2), (4.0, 1.2)])
+def test_a_sensor_that_looks_ahead_stands_on_the_level_that_ends_there(edge, drop):
+    """On a dock, of which little is seen, and at the foot of one."""
+    ahead = landforms.polyline(0.0, [(edge, 0.0), (edge, drop)])
+    points = scan_of(Scene('edge', ahead), SMALL_HDL, 1.7).points
+    pose = pose_of(points[np.abs(np.arctan2(points[:, 1], points[:, 0])) < 1.0])
+    assert pose.is_level and pose.height == pytest.approx(1.7, abs=0.1)
+    if drop < 0.0:
+        assert pose.measured.plane.other_height == pytest.approx(1.7 - drop, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ('sensor', 'height'), [(SMALL_VLP, 0.5), (SMALL_VLP, 1.0), (SMALL_OS1, 0.8)]
+)
+def test_a_narrow_jetty_is_the_ground_and_cars_around_are_not(sensor, height):
+    jetty = landforms.polyline(1.3, [(-2.0, -1.5), (-1.7, 0.0), (1.7, 0.0), (2.0, -1.5)])
+    for scene, own in ((Scene('jetty', jetty), height), ('traffic_jam', height + 0.8)):
+        pose = pose_of(scan_of(scene, sensor, own, seed=3).points)
+        assert pose.is_level and pose.height == pytest.approx(own, abs=0.05)
+
+
+def test_a_floor_under_a_ceiling_is_found_among_desks():
+    upwards = dataclasses.replace(
+        SMALL_OS1, elevations=tuple(np.radians(np.linspace(52, -52, 64)))
+    )
+    pose = pose_of(scan_of(desks(2.4), upwards, 0.95).points)
+    assert pose.is_level and pose.height == pytest.approx(0.95, abs=0.05)
+
+
+@pytest.mark.parametrize('sensor', [SMALL_VLP, SMALL_OS1], ids=lambda s: s.name)
+@pytest.mark.parametrize('scene', ['car_park', 'traffic_jam'])
+def test_lower_ends_of_objects_are_no_ground(scene, sensor):
+    """The ground was cut away before; a height that is given is taken."""
+    made = scan_of(scene, sensor, 1.8, seed=3)
+    over = made.points[:, 2] + 1.8
+    found = SEGMENTER.segment(made.points[over > 0.5])
+    assert not found.is_ground.any() and found.pose.warnings == (NO_HEIGHT, LOWER_ENDS)
+    assert segmenter(height=1.8).segment(made.points[over > 0.5]).pose.warnings == ()
+    assert SEGMENTER.segment(made.points).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ('scale', 'move', 'said'),
+    [(1.0, (60.0, 20.0, 0.0), 'the origin of the cloud is not the sensor'),
+     (1.0, (700.0, 0.0, 30.0), 'the origin of the cloud is not the sensor'),
+     (120.0, (0.0, 0.0, 0.0), 'the cloud is not in metres'),
+     (0.001, (0.0, 0.0, 0.0), 'the cloud is not in metres')],
+)  # fmt: skip
+def test_a_cloud_in_another_frame_or_unit_is_named_and_its_origin_centres_it(scale, move, said):
+    points = scan_of('urban', SMALL_VLP, 0.8).points[:, :3].astype(np.float64)
+    assert said in pose_of(points * scale + move).warnings[1]
+    if not any(move):
+        return
+    own, there = SEGMENTER.segment(points), SEGMENTER.segment(points + move, origin=move)
+    np.testing.assert_array_equal(there.label, own.label)
+    np.testing.assert_allclose(there.ground_z - move[2], own.ground_z, atol=1e-9)
+    assert there.pose.height == pytest.approx(own.pose.height - move[2], abs=1e-4)
+    assert there.pose.sensor_height == pytest.approx(own.pose.height, abs=1e-4)
+    model, ours = GroundModel.of(there), GroundModel.of(own)
+    np.testing.assert_allclose(model.knot_points() - move, ours.knot_points(), atol=1e-9)
+    (height, _), (wanted, _) = model.at(*(points + move)[:, :2].T), ours.at(*points[:, :2].T)
+    np.testing.assert_allclose(height - move[2], wanted, atol=1e-6)
 
 
 @SENSORS

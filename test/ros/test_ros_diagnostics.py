@@ -159,6 +159,7 @@ def test_model_reports_the_newest_scan():
         ('Estimated roll (rad)', f'{pose.measured.roll:.4f}'),
         ('Sensor pitch (rad)', f'{pose.pitch:.4f}'),
         ('Estimated pitch (rad)', f'{pose.measured.pitch:.4f}'),
+        ('Height over another level (m)', 'unknown'),
         ('Taken from the scan', 'height'),
         ('Learning mode', 'every_frame'),
         ('Optimiser status', fit.status),

@@ -17,7 +17,7 @@ from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_columns, read_xyz
 from gp_ground_seg.ros import outputs
 from gp_ground_seg.ros.outputs import LABELLED_FIELDS as FIELDS
-from gp_ground_seg.ros.outputs import read_ground_model
+from gp_ground_seg.ros.outputs import MODEL_FIELDS, read_ground_model
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -44,18 +44,20 @@ def received(b, topic, message):
 
 
 def test_ground_model_gives_the_height_anywhere(b):
-    """Also that of a tilted sensor."""
+    """Also that of a tilted sensor, which is not where the frame of the cloud begins."""
     tilt = {'sensor.roll': 0.35, 'sensor.pitch': -0.2}
+    origin = {'sensor.origin_x': 1.5, 'sensor.origin_y': -0.5, 'sensor.origin_z': 1.0}
     points = street(6000)
-    points = ros.moved(points, xyz_of(points).astype(np.float64) @ rotation(*tilt.values()))
+    turned = xyz_of(points).astype(np.float64) @ rotation(*tilt.values())
+    points = ros.moved(points, turned + np.array([*origin.values()]))
+    tilt |= origin
     message = to_message(points, stamp=(17, 23), frame='velo_link')
     with b.changed(tilt):
         found = received(b, '~/ground_model', message)
     assert found.header == message.header
     assert (found.height, found.width) == (CONFIG.grid.n_segments, CONFIG.grid.n_bins + 1)
-    names = ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')
     layout = [(field.name, field.datatype, field.count) for field in found.fields]
-    assert layout == [(name, PointField.FLOAT32, 1) for name in names]
+    assert layout == [(name, PointField.FLOAT32, 1) for name in MODEL_FIELDS]
     model = read_ground_model(found)
     np.testing.assert_allclose((model.roll, model.pitch), (0.35, -0.2), atol=1e-6)
     expected = GroundSegmenter(CONFIG.replace(**tilt)).segment(xyz_of(points))

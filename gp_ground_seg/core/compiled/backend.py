@@ -46,7 +46,6 @@ class NumbaBackend:
 
     name = 'numba'
     fit_plane = staticmethod(ground_plane.fit_plane)
-    is_wet = staticmethod(ground_plane.is_wet)
     extract_lines = staticmethod(partial(find_lines, trace_lines=jit(entry=True)(trace)))
 
     def build_grid(self, xyz: PointArray, config: Config) -> Scan:

@@ -30,16 +30,6 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     tukey_weight,
     weight_at,
 )
-from gp_ground_seg.core.pipeline.mirror_images import (
-    BELOW_SIGHT,
-    NEAREST,
-    WET_REACH,
-    WET_SHARE,
-    is_image,
-    is_on_plane,
-    slope_of_sight,
-)
-from gp_ground_seg.core.pipeline.points import Direction
 
 WIDTH = 32
 """The number of points ends at a multiple of it, so that no loop over them has a remainder."""
@@ -55,39 +45,22 @@ _RING_TABLE = np.clip(np.searchsorted(RING_EDGES, _STARTS, side='right') - 1, 0,
 
 
 @jit(entry=True)
-def _fit_cells(
-    cells: LowestPoints, n: int, max_slope: float, origin: Direction
-) -> tuple[float, ...]:
+def _fit_cells(cells: LowestPoints, n: int, max_slope: float) -> tuple[float, ...]:
     """Fields of the `GroundPlane`."""
-    return fit_cells(cells, n, max_slope, origin)[:]
+    return fit_cells(cells, n, max_slope)[:]
 
 
-def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> GroundPlane | None:
+def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     """Do what `gp_ground_seg.core.pipeline.ground_plane.fit_plane` does, to rounding."""
     directions = segment_directions(len(candidates.offsets) - 1)
     x, y, z, r, tolerance, inverse, weight, lowest_z = np.empty((8, N_LARGEST))
     number = np.empty(N_LARGEST, dtype=np.int64)
-    cells = LowestPoints(x, y, z, r, tolerance, inverse, weight, number, lowest_z)
+    is_alone = np.zeros(N_LARGEST, dtype=np.bool_)
+    cells = LowestPoints(x, y, z, r, tolerance, inverse, weight, number, lowest_z, is_alone)
     n = _tabulate(candidates, directions, cells)
     cells = LowestPoints._make(column[: -(-n // WIDTH) * WIDTH] for column in cells)
-    plane = GroundPlane(*_fit_cells(cells, n, max_slope, origin))  # type: ignore[arg-type]
+    plane = GroundPlane(*_fit_cells(cells, n, max_slope))  # type: ignore[arg-type]
     return plane if plane.n_support > 0 else None
-
-
-@jit(entry=True)
-def is_wet(candidates: Candidates, plane_z: float, sensor_z: float) -> bool:
-    """Do what `gp_ground_seg.core.pipeline.mirror_images.is_wet` does."""
-    n_images = n_ground = 0
-    for m in range(len(candidates.offsets) - 1):
-        nearer = -np.inf
-        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
-            r, z = candidates.r[c], candidates.z[c]
-            if NEAREST <= r < WET_REACH:
-                slope = slope_of_sight(r, z, sensor_z)
-                n_images += is_image(r, z, slope, nearer, plane_z, sensor_z, BELOW_SIGHT)
-                if is_on_plane(r, z, plane_z):
-                    n_ground, nearer = n_ground + 1, max(nearer, slope)
-    return n_images > WET_SHARE * n_ground
 
 
 @jit(entry=True)
@@ -121,13 +94,13 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
             first, end = starts[cell], ends[cell]
             _sort(near_r, near_z, home, first, end)
             k = _lowest_together(near_r, near_z, first, end)
+            cells.is_alone[n], k = k < 0, max(k, first)
             cells.lowest_z[n] = near_z[first]
             range_, m = near_r[k], home[k]
             cells.x[n], cells.y[n] = range_ * directions[0, m], range_ * directions[1, m]
             cells.z[n], cells.r[n] = near_z[k], range_
-            cells.tolerance[n] = tolerance_at(range_)
-            cells.inverse[n] = 1.0 / cells.tolerance[n]
-            cells.weight[n], cells.cell[n] = weight_at(range_), cell
+            cells.tolerance[n], cells.weight[n] = tolerance_at(range_), weight_at(range_)
+            cells.inverse[n], cells.cell[n] = 1.0 / cells.tolerance[n], cell
             n += 1
     for c in range(n, -(-n // WIDTH) * WIDTH):
         cells.x[c], cells.y[c], cells.z[c] = 0.0, 0.0, _OUT_OF_REACH
@@ -152,11 +125,11 @@ def _sort(r: FloatArray, z: FloatArray, home: IntArray, first: int, end: int) ->
 
 @jit()
 def _lowest_together(r: FloatArray, z: FloatArray, first: int, end: int) -> int:
-    """Lowest of the sorted ones from `first` to `end` that is not by itself, or the first."""
+    """Lowest of the sorted ones from `first` to `end` that is not alone, or -1."""
     for k in range(first, end - N_TOGETHER + 1):
         if z[k + N_TOGETHER - 1] - z[k] <= tolerance_at(r[k]):
             return k
-    return first
+    return -1
 
 
 @compiled_form(ground_plane.supports_of)
@@ -180,10 +153,9 @@ def _support_of(plane: Plane, cells: LowestPoints) -> float:
 
 
 @compiled_form(ground_plane.refutation_of)
-def refutation_of(plane: Plane, cells: LowestPoints, n: int, origin: Direction) -> float:
-    """Weight of the rays from `origin` that cross a plane where it should have stopped them."""
-    x, y, z = origin
-    clearance, total = max(distance(x, y, z, plane), 0.0), 0.0
+def refutation_of(plane: Plane, cells: LowestPoints, n: int) -> float:
+    """Weight of the rays that cross a plane where it should have stopped them."""
+    total = 0.0
     is_seen, reach, heights = np.zeros(N_CELLS, np.bool_), np.empty(N_SECTORS), np.empty(n)
     for sector in range(N_SECTORS):
         reach[sector] = LEAST_REACH
@@ -193,9 +165,9 @@ def refutation_of(plane: Plane, cells: LowestPoints, n: int, origin: Direction) 
             sector = cells.cell[c] // N_RINGS
             is_seen[cells.cell[c]], reach[sector] = True, max(reach[sector], cells.r[c])
     for c in range(n):
-        if heights[c] * cells.inverse[c] < -CLEARLY_OFF:
+        if heights[c] * cells.inverse[c] < -CLEARLY_OFF and not cells.is_alone[c]:
             sector = cells.cell[c] // N_RINGS
-            crossing = crossed_at(cells.r[c], heights[c], clearance)
+            crossing = crossed_at(cells.r[c], heights[c], plane[0])
             if crossing < reach[sector]:
                 ring = 0
                 while ring < N_RINGS - 1 and crossing >= RING_EDGES[ring + 1]:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray, Values
+from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray, Values
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import SENSOR_HEIGHTS
 from gp_ground_seg.core.pipeline.points import Direction
@@ -36,8 +36,6 @@ _NONE = -1
 NEAR, ENOUGH_NEAR = 8.0, 12
 """Range [m] and least number of the points that the height is measured at: kerbs and verges
 lift or lower the plane as a whole."""
-FAR = 10.0
-"""Range that the ground reaches outdoors, and walls and ceilings of rooms seldom [m]."""
 MIN_HEIGHT, MAX_HEIGHT = SENSOR_HEIGHTS
 """Heights of the origin over a plane that can be the ground [m]; in the frame of a vehicle the
 ground may lie above it."""
@@ -46,11 +44,30 @@ CLEARLY_OFF = 2.0
 MIDDLE = 4.0
 """Range of the points with the most weight [m]: nearer ones may be the robot's own body, and
 farther ones another level than the one that it stands on."""
-LEAST_REACH = 3.0
-"""Range to which rays may not cross the ground in any direction [m]: edges of a dock or a dike
-may be that near, and the robot's own body does not reach much farther."""
+LEAST_REACH = 1.5
+"""Range to which rays may not cross the ground in any direction [m]: edges of a jetty may be that
+near."""
+BODY_REACH = 3.0
+"""Range that the ground reaches, and the robot's own body does not [m]."""
 REFUTATION = 8.0
-"""Weight of a ray that crosses the plane over that of a point on it, at the same range."""
+"""Weight of a ray that crosses the plane over that of a point on it at `MIDDLE`."""
+APART, PARALLEL = 0.3, 0.06
+"""Distance of two levels, at least [m], and difference of their slopes, at most."""
+OTHER_SHARE = 0.2
+"""Score of another level over the best one from which it counts, and may carry the robot: of the
+top of a dock only the nearest rings are seen."""
+CLEAN = 0.5
+"""Share of the support in all evidence from which a level is not refuted."""
+TIGHT = 0.8
+"""Support of a level over the weights of all points within the tolerance of it: two thirds if
+their heights are any within it."""
+ASIDE = 0.6
+"""Length of the mean of the directions in which a level is seen, from which it lies on one side of
+the robot: it is 0.64 of what fills a half-plane. The mean direction of all that is seen is taken
+off, for sensors that do not look all around."""
+LEVEL_SHARE, STRAIGHT = 0.8, 0.1
+"""Score of the best level plane, over that of one that is tilted by less than `STRAIGHT` [rad],
+from which the tilt explains nothing: shelves on one side and floor on the other."""
 
 Plane = tuple[float, float, float]
 """Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
@@ -86,6 +103,7 @@ class LowestPoints(NamedTuple):
     cell: IntArray  # (C,) number of the cell: sector times `N_RINGS`, plus ring
     # (C,) height of the lowest of all [m], which may lie alone: floor at the foot of a wall
     lowest_z: FloatArray
+    is_alone: BoolArray  # (C,) whether there are not `N_TOGETHER`, as where noise is the lowest
 
 
 @lru_cache(maxsize=4)
@@ -107,13 +125,14 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     """
     alone, together = _lowest(candidates.offsets, candidates.r, candidates.z)
     cell = np.flatnonzero(alone != _NONE)
-    index = np.where(together == _NONE, alone, together)[cell]
+    is_alone = together[cell] == _NONE
+    index = np.where(is_alone, alone[cell], together[cell])
     segment = np.searchsorted(candidates.offsets, index, side='right') - 1
     cosine, sine = segment_directions(len(candidates.offsets) - 1)
     r = candidates.r[index]
     x, y, tolerance = r * cosine[segment], r * sine[segment], tolerance_at(r)
     z, weight, lowest_z = candidates.z[index], weight_at(r), candidates.z[alone[cell]]
-    return LowestPoints(x, y, z, r, tolerance, 1.0 / tolerance, weight, cell, lowest_z)
+    return LowestPoints(x, y, z, r, tolerance, 1.0 / tolerance, weight, cell, lowest_z, is_alone)
 
 
 @shared
@@ -155,7 +174,7 @@ def _lowest(offsets: IntArray, r: FloatArray, z: FloatArray) -> tuple[IntArray, 
 class GroundPlane(NamedTuple):
     """The plane z = -height + slope_x x + slope_y y; `NO_PLANE` if no cell lies on any."""
 
-    height: float = 0.0  # how far below the origin of the cloud it is, along z [m]
+    height: float = 0.0  # how far below the sensor it is, along z [m]
     slope_x: float = 0.0  # rise per metre
     slope_y: float = 0.0  # rise per metre
     # as `height`, for the parallel plane through the middle of the near cells [m]
@@ -163,8 +182,6 @@ class GroundPlane(NamedTuple):
     support: float = 0.0  # share of the cells that lie on it
     near_support: float = 0.0  # the same of their weights, see `weight_at`
     coverage: float = 0.0  # share of all sectors around the sensor with such a cell
-    # share of the sectors with any cell that have such a cell `FAR` away
-    far_coverage: float = 0.0
     reach: float = 0.0  # range within which nine of ten of these cells are [m]
     # angle at which the sensor sees nine of ten of these below the plane through it that is
     # parallel to this one, at most [rad]: on a slope not that below the horizon
@@ -173,9 +190,11 @@ class GroundPlane(NamedTuple):
     # of them left out at either end: the lowest beam alone, on walls, makes a cone that looks
     # like a plane.
     spread: float = 0.0
-    # share of the sectors with any cell where rays to it cross a nearer level that goes on behind
-    seen_through: float = 0.0
+    # share of the sectors with any cell whose nearest is clearly over it, and below the sensor
+    overhung: float = 0.0
     n_support: int = 0  # how many cells lie on it
+    # as `height`, of the parallel level with the next best score [m]; NaN if there is none
+    other_height: float = math.nan
 
     @property
     def depth(self) -> float:
@@ -196,32 +215,32 @@ class GroundPlane(NamedTuple):
 NO_PLANE = GroundPlane()
 
 
-def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> GroundPlane | None:
+def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     """Fit the plane that most of the lowest points lie on and few rays cross; None without one.
 
     Consensus (Fischler & Bolles, CACM 1981) over planes through a fixed, evenly spread
     choice of three cells and level planes through one, then a redescending M-estimator
     (Beaton & Tukey, Technometrics 1974) from the best of them. `max_slope` is that of the
-    steepest plane to look for, as rise per metre; `origin` is where the sensor is [m].
+    steepest plane to look for, as rise per metre.
     """
     cells = lowest_points(candidates)
-    plane = fit_cells(cells, len(cells.z), max_slope, origin)
+    plane = fit_cells(cells, len(cells.z), max_slope)
     return plane if plane.n_support > 0 else None
 
 
 @shared
-def fit_cells(cells: LowestPoints, n: int, max_slope: float, origin: Direction) -> GroundPlane:
+def fit_cells(cells: LowestPoints, n: int, max_slope: float) -> GroundPlane:
     """Fit a plane to the first `n` points."""
-    is_found, best = False, (0.0, 0.0, 0.0)
-    if n >= MIN_CELLS:
-        is_found, best = best_hypothesis(cells, n, max_slope, origin)
-    if not is_found:
+    if n < MIN_CELLS:
+        return NO_PLANE
+    best, score, other = own_level(cells, n, max_slope)
+    if score <= 0.0:
         return NO_PLANE
     plane = refined(cells, best)
     if not is_possible(plane, LOOSER * max_slope):
         # The refinement has drifted off to a plane that cannot be the ground.
         plane = best
-    return described(cells, n, plane, origin)
+    return described(cells, n, plane, other)
 
 
 def _spread(n: int) -> FloatArray:
@@ -240,10 +259,38 @@ SPREAD = _spread(N_TRIPLES)
 
 
 @shared
-def best_hypothesis(
-    cells: LowestPoints, n: int, max_slope: float, origin: Direction
-) -> tuple[bool, Plane]:
-    """Plane with the best score, and whether there is one."""
+def own_level(cells: LowestPoints, n: int, max_slope: float) -> tuple[Plane, float, float]:
+    """Plane of the level that the robot stands on, its score or 0, and another's height or NaN.
+
+    It is the plane with the best score, or a parallel one over it that is not refuted and lies
+    around the robot: the top of a dock, of which less is seen than of what lies below it.
+    """
+    planes = hypotheses(cells, n, max_slope)
+    supports = supports_of(planes, cells)
+    best, score, _ = best_of(planes, supports, cells, n, 0.0)
+    if score <= 0.0:
+        return best, 0.0, math.nan
+    height, slope_x, slope_y = planes[:, 0], planes[:, 1], planes[:, 2]
+    if 0.0 < math.hypot(best[1], best[2]) < STRAIGHT:
+        levels = np.where(np.hypot(slope_x, slope_y) == 0.0, supports, 0.0)
+        level, level_score, _ = best_of(planes, levels, cells, n, LEVEL_SHARE * score)
+        if level_score > 0.0:
+            best, score = level, level_score
+    is_parallel = np.hypot(slope_x - best[1], slope_y - best[2]) < PARALLEL
+    is_over = is_parallel & (height > 0.0) & (height < best[0] - APART)
+    levels = np.where(is_over, supports, 0.0)
+    over, over_score, support = best_of(planes, levels, cells, n, OTHER_SHARE * score)
+    if over_score > CLEAN * support and is_around(cells, n, over, best, support):
+        return over, over_score, best[0]
+    levels = np.where(is_parallel & (height > best[0] + APART), supports, 0.0)
+    under, under_score, _ = best_of(planes, levels, cells, n, OTHER_SHARE * score)
+    other = over if over_score > under_score else under
+    return best, score, other[0] if max(over_score, under_score) > 0.0 else math.nan
+
+
+@shared
+def hypotheses(cells: LowestPoints, n: int, max_slope: float) -> FloatArray:
+    """Level planes through some of the points, and planes through three, (P, 3)."""
     n_level, n_planes = min(n, N_LEVEL), 0
     planes = np.empty((n_level + len(SPREAD), 3))
     for t in range(len(planes)):
@@ -255,9 +302,41 @@ def best_hypothesis(
         if is_possible(plane, max_slope):
             planes[n_planes, 0], planes[n_planes, 1], planes[n_planes, 2] = plane
             n_planes += 1
-    if n_planes == 0:
-        return False, (0.0, 0.0, 0.0)
-    return True, best_of(planes[:n_planes], cells, n, origin)
+    return planes[:n_planes]
+
+
+@shared
+def is_around(cells: LowestPoints, n: int, over: Plane, best: Plane, support: float) -> bool:
+    """Whether a level over another one lies on all sides, nearer than the other.
+
+    It reaches farther than the own body of the robot, and its `support` is that of one level, not
+    of cars of many heights.
+    """
+    x = y = seen_x = seen_y = reach = told = told_other = whole = 0.0
+    n_over, n_seen, last, last_told = 0, 0, -1, -1
+    for c in range(n):
+        # Cells come sector by sector, from near to far.
+        sector, r = cells.cell[c] // N_RINGS, cells.r[c]
+        cosine, sine = cells.x[c] / r, cells.y[c] / r
+        if sector != last:
+            n_seen, last = n_seen + 1, sector
+            seen_x, seen_y = seen_x + cosine, seen_y + sine
+        height = distance(cells.x[c], cells.y[c], cells.z[c], over)
+        is_on_it = abs(height) <= cells.tolerance[c]
+        if is_on_it:
+            reach, whole = max(reach, r), whole + cells.weight[c]
+        is_on_other = abs(distance(cells.x[c], cells.y[c], cells.z[c], best)) <= cells.tolerance[c]
+        if sector != last_told and (is_on_it or is_on_other):
+            last_told = sector
+            weight = weight_at(max(r, MIDDLE)) ** 2
+            if is_on_it:
+                n_over, x, y, told = n_over + 1, x + cosine, y + sine, told + weight
+            else:
+                told_other += weight
+    is_one_level = support >= TIGHT * RESOLUTION * whole
+    if n_over == 0 or reach < BODY_REACH or told <= told_other or not is_one_level:
+        return False
+    return math.hypot(x / n_over - seen_x / n_seen, y / n_over - seen_y / n_seen) < ASIDE
 
 
 @shared
@@ -281,33 +360,26 @@ def is_possible(plane: Plane, max_slope: float) -> bool:
 
 
 @shared
-def best_of(planes: FloatArray, cells: LowestPoints, n: int, origin: Direction) -> Plane:
-    """Plane with the best score: its support, times the share of it in all evidence.
+def best_of(
+    planes: FloatArray, supports: FloatArray, cells: LowestPoints, n: int, least: float
+) -> tuple[Plane, float, float]:
+    """Plane with the best score above `least`, its score, 0 if there is none, and its support.
 
-    The score is at most the support, so that few planes need their refutation.
+    The score is the support, times the share of it in all evidence. It is at most the support, so
+    that few planes need their refutation.
     """
-    supports, best, best_score = supports_of(planes, cells), (0.0, 0.0, 0.0), -1.0
-    while True:
-        p = np.argmax(supports)
-        support = supports[p]
-        if support <= best_score:
-            return best
+    left, best, best_score, best_support = supports.copy(), (0.0, 0.0, 0.0), 0.0, 0.0
+    while len(left) > 0:
+        p = np.argmax(left)
+        support = left[p]
+        if support <= max(best_score, least):
+            break
         plane = (planes[p, 0], planes[p, 1], planes[p, 2])
-        evidence = support + refutation_of(plane, cells, n, origin)
-        score = support * support / evidence if evidence > 0.0 else 0.0
-        if score > best_score:
-            best, best_score = plane, score
-        supports[p] = -1.0
-
-
-def supports_in(candidates: Candidates, planes: list[Plane]) -> FloatArray:
-    """Support of planes by a scan, (P,)."""
-    return supports_of(np.array(planes), lowest_points(candidates))
-
-
-def plane_across(up: Direction, depth: float) -> Plane:
-    """Plane across a unit vector, whose `z` is not 0, at a distance below the origin [m]."""
-    return depth / up[2], -up[0] / up[2], -up[1] / up[2]
+        score = support * support / (support + refutation_of(plane, cells, n))
+        if score > max(best_score, least):
+            best, best_score, best_support = plane, score, support
+        left[p] = -1.0
+    return best, best_score, best_support
 
 
 def supports_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
@@ -343,42 +415,44 @@ def support_by(
     return np.floor(choose(support > 0.0, support, 0.0))
 
 
-def refutation_of(plane: Plane, cells: LowestPoints, n: int, origin: Direction) -> float:
-    """Weight of the rays from `origin` that cross a plane where it should have stopped them.
+def refutation_of(plane: Plane, cells: LowestPoints, n: int) -> float:
+    """Weight of the rays that cross a plane where it should have stopped them.
 
-    These are rays to points clearly below. In a sector the plane is taken to reach as far as
-    its farthest point, at least `LEAST_REACH`: over the edge of a dike or a dock rays pass. A
-    cell with a point on the plane has stopped rays: what crosses there is a mirror image on a wet
-    road. The plane of roofs of cars, or of tables, is crossed near the sensor, before it begins.
+    These are rays to points clearly below it that do not lie alone. In a sector the plane is taken
+    to reach as far as its farthest point, at least `LEAST_REACH`: over the edge of a dike or a
+    dock rays pass. A cell with a point on the plane has stopped rays: what crosses there is a
+    mirror image on a wet road. Roofs of cars, and tables, are crossed next to the sensor.
     """
     height = distance(cells.x, cells.y, cells.z, plane)
     d, sector = height * cells.inverse, cells.cell // N_RINGS
-    is_on, is_below = np.abs(d) < 1.0, d < -CLEARLY_OFF
+    is_on, is_below = np.abs(d) < 1.0, (d < -CLEARLY_OFF) & ~cells.is_alone
     is_seen, reach = np.zeros(N_SECTORS * N_RINGS, dtype=bool), np.full(N_SECTORS, LEAST_REACH)
     is_seen[cells.cell[is_on]] = True
     np.maximum.at(reach, sector[is_on], cells.r[is_on])
     sector = sector[is_below]
-    clearance = max(distance(*origin, plane), 0.0)
-    crossing = crossed_at(cells.r[is_below], height[is_below], clearance)
+    crossing = crossed_at(cells.r[is_below], height[is_below], plane[0])
     crossed = sector * N_RINGS + np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
     counts = (crossing < reach[sector]) & ~is_seen[crossed]
     return float(refutation_by(crossing[counts]).sum())
 
 
 @shared
-def crossed_at(r: Values, height: Values, clearance: Values) -> Values:
+def crossed_at(r: Values, height: Values, clearance: float) -> Values:
     """Range where the ray to a point below a plane crosses it, from `clearance` above [m].
 
-    `height` is that of the point, negative. Of a plane that is not below the sensor it is 0, where
-    a ray has no weight.
+    `height` is that of the point, negative. A ray that is below the plane all the way, as that of
+    a ceiling, is taken to cross it where it ends.
     """
-    return r * clearance / (clearance - height)
+    return r * clearance / (clearance - height) if clearance > 0.0 else r
 
 
 @shared
 def refutation_by(crossing: Values) -> Values:
-    """Refutation of a plane by a ray that crosses it at a range; a whole number."""
-    return np.floor(REFUTATION * RESOLUTION * weight_at(crossing))
+    """Refutation of a plane by a ray that crosses it at a range; a whole number.
+
+    What is crossed next to the robot does not carry it.
+    """
+    return np.floor(REFUTATION * RESOLUTION * weight_at(np.maximum(crossing, MIDDLE)))
 
 
 @shared
@@ -430,29 +504,29 @@ def solve_plane(moments: Moments, plane: Plane) -> Plane:
 
 
 @shared
-def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> GroundPlane:
+def described(cells: LowestPoints, n: int, plane: Plane, other_height: float) -> GroundPlane:
     """Measure how well a plane is seen."""
     height, slope_x, slope_y = plane
     ranges, drops, near, angles = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     n_on_it, n_near, weight, whole = 0, 0, 0.0, 0.0
-    n_seen = n_covered = n_far = 0
-    last_seen = last_covered = last_far = -1
+    n_seen = n_covered = n_overhung = 0
+    last_seen = last_covered = -1
     for c in range(n):
         sector, r = cells.cell[c] // N_RINGS, cells.r[c]
         whole += cells.weight[c]
+        z = cells.z[c]
+        d = distance(cells.x[c], cells.y[c], z, plane)
         # Cells come sector by sector: one that differs from the last is new.
         if sector != last_seen:
             n_seen, last_seen = n_seen + 1, sector
-        z = cells.z[c]
-        d = distance(cells.x[c], cells.y[c], z, plane)
+            n_overhung += d > CLEARLY_OFF * cells.tolerance[c] and z < 0.0
         if not abs(d) <= cells.tolerance[c]:
             z = cells.lowest_z[c]
             d = distance(cells.x[c], cells.y[c], z, plane)
         if not abs(d) <= cells.tolerance[c]:
             continue
-        away = math.hypot(cells.x[c] - origin[0], cells.y[c] - origin[1])
-        ranges[n_on_it], drops[n_on_it] = r, math.atan2(origin[2] - z, away)
-        angles[n_on_it] = math.atan2(distance(origin[0], origin[1], origin[2], plane) - d, away)
+        ranges[n_on_it], drops[n_on_it] = r, math.atan2(-z, r)
+        angles[n_on_it] = math.atan2(height - d, r)
         n_on_it += 1
         weight += cells.weight[c]
         if r < NEAR:
@@ -460,8 +534,6 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> G
             n_near += 1
         if sector != last_covered:
             n_covered, last_covered = n_covered + 1, sector
-        if r >= FAR and sector != last_far:
-            n_far, last_far = n_far + 1, sector
     if n_on_it == 0:
         return NO_PLANE
     few, most = n_on_it // 10, (9 * n_on_it) // 10
@@ -474,40 +546,13 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> G
         support=n_on_it / n,
         near_support=weight / whole,
         coverage=n_covered / N_SECTORS,
-        far_coverage=n_far / n_seen,
         reach=ranked(ranges[:n_on_it], most),
         depression=ranked(angles[:n_on_it], most),
         spread=ranked(drops[:n_on_it], most) - ranked(drops[:n_on_it], few),
-        seen_through=count_seen_through(cells, n, plane, origin) / n_seen,
+        overhung=n_overhung / n_seen,
         n_support=n_on_it,
+        other_height=other_height,
     )
-
-
-@shared
-def count_seen_through(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> int:
-    """Count the sectors in which rays to a plane cross a level over it that goes on behind.
-
-    The level is that of the nearest cell, clearly over the plane and below the sensor, and reaches
-    as far as the farthest cell at this height. That of the own vehicle ends before.
-    """
-    n_sectors, last, last_counted, is_over, level, farthest = 0, -1, -1, False, 0.0, 0.0
-    for c in range(n):
-        # Cells come sector by sector, from near to far.
-        sector = cells.cell[c] // N_RINGS
-        if sector != last:
-            last, level = sector, cells.z[c]
-            over = distance(cells.x[c], cells.y[c], level, plane)
-            is_over = over > CLEARLY_OFF * cells.tolerance[c] and level < origin[2]
-        if not is_over or sector == last_counted:
-            continue
-        r, z = cells.r[c], cells.z[c]
-        over = distance(cells.x[c], cells.y[c], z, plane)
-        crosses = r * (origin[2] - level) < farthest * (origin[2] - z)
-        if abs(z - level) <= cells.tolerance[c]:
-            farthest = r
-        elif crosses and abs(over) <= cells.tolerance[c]:
-            n_sectors, last_counted = n_sectors + 1, sector
-    return n_sectors
 
 
 def ranked(values: FloatArray, rank: int) -> float:

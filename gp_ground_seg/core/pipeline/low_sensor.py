@@ -7,8 +7,7 @@ that would accept trunks, persons and cars as ground.
 
 from __future__ import annotations
 
-from gp_ground_seg.core.parameters.config import Config, SensorConfig, find_spec
-from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
+from gp_ground_seg.core.parameters.config import Config, find_spec
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
 REFERENCE_HEIGHT = 1.0
@@ -22,13 +21,13 @@ MIN_DEPRESSION = 0.105
 From the origin of a vehicle, at its axles, a sensor on the roof seems to see it at less."""
 
 
-def for_sensor(config: Config, pose: SensorPose, sensor: SensorConfig) -> Config:
+def for_sensor(config: Config, pose: SensorPose) -> Config:
     """Return `config` with what depends on the height of the sensor in proportion to it.
 
     These are the gates of the growth, the tolerance of ground and the least height of obstacles;
     nothing for a sensor that is as high as `REFERENCE_HEIGHT`, or that is not seen to be lower.
     """
-    share = sensor_height_of(pose, sensor) / REFERENCE_HEIGHT
+    share = sensor_height_of(pose) / REFERENCE_HEIGHT
     if share >= 1.0 or config.label.rule != 'roughness':
         return config
     names = (
@@ -42,19 +41,15 @@ def for_sensor(config: Config, pose: SensorPose, sensor: SensorConfig) -> Config
     return config.replace(**{name: max(share * config[name], least[name]) for name in names})
 
 
-def sensor_height_of(pose: SensorPose, sensor: SensorConfig) -> float:
+def sensor_height_of(pose: SensorPose) -> float:
     """Height of a low sensor over the ground, `REFERENCE_HEIGHT` of others [m]."""
-    origin = pose.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)
-    height = pose.height + float(origin[2])
-    is_there = is_seen_from_sensor(pose) and height >= LOWEST
-    return min(height, REFERENCE_HEIGHT) if is_there else REFERENCE_HEIGHT
+    is_there = is_seen_from_sensor(pose) and pose.sensor_height >= LOWEST
+    return min(pose.sensor_height, REFERENCE_HEIGHT) if is_there else REFERENCE_HEIGHT
 
 
 def is_seen_from_sensor(pose: SensorPose) -> bool:
-    """Whether the ground is seen from where the sensor is taken to be, and not from elsewhere."""
-    return pose.measured is not None and is_seen_steeply(pose.measured.plane)
+    """Whether the ground is seen at an angle at which a sensor over it sees the nearest of it.
 
-
-def is_seen_steeply(plane: GroundPlane) -> bool:
-    """Whether a plane is seen at an angle at which a sensor over it sees the nearest ground."""
-    return plane.depression >= MIN_DEPRESSION
+    Else the sensor is not where it is taken to be.
+    """
+    return pose.measured is not None and pose.measured.plane.depression >= MIN_DEPRESSION

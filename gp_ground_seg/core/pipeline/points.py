@@ -161,6 +161,12 @@ def objection_to_ranges(xyz: PointArray) -> str:
     )
 
 
+@np.errstate(invalid='ignore', over='ignore')
+def moved(xyz: PointArray, origin: Place) -> PointArray:
+    """Points (N, 3) about `origin`, in their own precision; `xyz` itself if that is theirs."""
+    return (xyz - np.array(origin)).astype(xyz.dtype) if any(origin) else xyz
+
+
 def in_columns(xyz: PointArray) -> PointArray:
     """Points (N, 3), read-only, with each coordinate contiguous; a copy if they are not."""
     result: PointArray = np.ascontiguousarray(xyz.T).T

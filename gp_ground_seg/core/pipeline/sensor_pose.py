@@ -10,15 +10,11 @@ from functools import lru_cache
 import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.frame import Candidates, FloatArray, PointArray, usual_errors
+from gp_ground_seg.core.frame import FloatArray, PointArray, usual_errors
 from gp_ground_seg.core.parameters.config import SensorConfig
 from gp_ground_seg.core.parameters.schema import AUTO
-from gp_ground_seg.core.pipeline.ground_plane import (
-    GroundPlane,
-    Plane,
-    plane_across,
-    supports_in,
-)
+from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
+from gp_ground_seg.core.pipeline.ground_view import View, refusal
 from gp_ground_seg.core.pipeline.points import (
     Direction,
     angles_of,
@@ -27,12 +23,6 @@ from gp_ground_seg.core.pipeline.points import (
     rounded,
     turned_back,
     vertical,
-)
-from gp_ground_seg.core.pipeline.up_axis import (
-    MIN_COVERAGE,
-    View,
-    is_well_supported,
-    refusal,
 )
 
 DEFAULT_HEIGHT = 1.73
@@ -50,10 +40,6 @@ LOW_GROUND = (
 LEAST_DEPRESSION = 0.06
 """Angle below the horizontal at which a sensor sees the nearest tenth of a plane that it is less
 than `LOW` above [rad]. The origin of a vehicle is as low, but sees no ground that near."""
-FEW_CELLS = 45
-"""Cells on the plane below which its height is doubtful. Whole scans that show the height have
-more; parts of a scan, up to 60 degrees wide, have fewer, or less than `MIN_COVERAGE` of the
-sectors."""
 LITTLE_GROUND = (
     'the scan shows little ground near the sensor, and the height estimated from it may be wrong: '
     'set sensor.height'
@@ -65,9 +51,6 @@ LEAST_COSINE = 0.1
 """Cosine of the tilt from which the sensor's z axis meets the ground."""
 HEIGHT_CONTRADICTION = 0.3
 """Difference to a given height from which the scan contradicts it [m]."""
-ALSO_SEEN = 0.2
-"""Support of the level plane at a given height, over that of the plane found, from which the scan
-does not contradict it: it shows two levels, and which of them is the own one may be unclear."""
 TILT_CONTRADICTION = 0.15
 """Tilt left under given angles from which the scan contradicts them [rad]: no usual slope."""
 
@@ -84,6 +67,8 @@ class MeasuredPose:
     tells_tilt: bool  # the same for the tilt
     # in the frame levelled by the angles given, or where that is far from level in its own
     plane: GroundPlane
+    # as `height`, over another level that is seen, higher or lower; NaN if there is none [m]
+    other_height: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -109,6 +94,8 @@ class SensorPose:
         Why a height that comes from this scan may be wrong, a line for each.
     is_fallback : bool
         Whether what is not given, and `measured`, are those of an earlier scan.
+    origin : tuple of float
+        Place of the sensor in the frame of the cloud, if it was given [m].
     """
 
     height: float
@@ -122,6 +109,12 @@ class SensorPose:
     is_height_default: bool = False
     doubts: tuple[str, ...] = ()
     is_fallback: bool = False
+    origin: Direction = (0.0, 0.0, 0.0)
+
+    @property
+    def sensor_height(self) -> float:
+        """Height of the sensor above the ground near it, along the vertical [m]."""
+        return self.height + _product(vertical(self.roll, self.pitch), self.origin)
 
     @property
     def is_well_seen(self) -> bool:
@@ -136,7 +129,7 @@ class SensorPose:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings for the user, a line for each."""
-        return (NO_HEIGHT,) if self.is_height_default else self.doubts
+        return (NO_HEIGHT,) * self.is_height_default + self.doubts
 
     @property
     def rotation(self) -> FloatArray:
@@ -173,25 +166,27 @@ def given_pose(sensor: SensorConfig) -> SensorPose:
         0.0 if sensor.roll == AUTO else sensor.roll,
         0.0 if sensor.pitch == AUTO else sensor.pitch,
         is_height_default=sensor.height == AUTO,
+        origin=(sensor.origin_x, sensor.origin_y, sensor.origin_z),
     )
 
 
 def estimate_pose(
-    candidates: Candidates, sensor: SensorConfig, view: View | None, elsewhere: View | None
+    sensor: SensorConfig, view: View | None, elsewhere: View | None, objection: str
 ) -> SensorPose:
     """Estimate what is auto, and check what is not against the scan.
 
-    `candidates` are in the frame levelled by `given_pose`, and `view` is the plane of the ground;
-    `elsewhere` is where it clearly lies if that is too far from z. Raises a PointCloudError if
-    it is, and roll or pitch is auto.
+    `view` is the plane of the ground, in the frame levelled by `given_pose`; without one,
+    `objection` may say why. `elsewhere` is where the ground clearly lies if that is too far from
+    z. Raises a PointCloudError if it is, and roll or pitch is auto.
     """
     given, contradictions = given_pose(sensor), tuple[str, ...]()
     if elsewhere is not None:
         contradictions = (refusal(elsewhere, given.rotation),)
         if AUTO in (sensor.roll, sensor.pitch):
             raise PointCloudError(*contradictions)
+    doubts = (objection,) if objection and sensor.height == AUTO else ()
     if view is None:
-        return dataclasses.replace(given, contradictions=contradictions)
+        return dataclasses.replace(given, contradictions=contradictions, doubts=doubts)
     plane, tells_height, tells_tilt = view.plane, view.tells_height, view.tells_tilt
     up = view.up if given.is_level else turned_back(view.up, given.rotation)
     roll, pitch = _levelled(up, sensor)
@@ -201,11 +196,13 @@ def estimate_pose(
     along = _product(levelled, up) if corrects else view.up[2]
     if not corrects:
         roll, pitch = given.roll, given.pitch
-    height = rounded(plane.near_height * plane.normal[2] / along)
-    measured = MeasuredPose(height, *angles_of(up), tells_height, tells_tilt, plane)
+    height = plane.near_height * plane.normal[2] / along
+    height = rounded(height - _product(vertical(roll, pitch), given.origin))
+    other = height + plane.other_height - plane.near_height
+    measured = MeasuredPose(height, *angles_of(up), tells_height, tells_tilt, plane, other)
     estimates_height = sensor.height == AUTO and tells_height
-    level = turned_back(vertical(roll, pitch), given.rotation.T)
-    return SensorPose(
+    return dataclasses.replace(
+        given,
         height=height if estimates_height else given.height,
         roll=roll,
         pitch=pitch,
@@ -213,10 +210,9 @@ def estimate_pose(
         roll_estimated=sensor.roll == AUTO and corrects,
         pitch_estimated=sensor.pitch == AUTO and corrects,
         measured=measured,
-        contradictions=contradictions
-        or _contradictions(candidates, sensor, measured, view, level),
+        contradictions=contradictions or _contradictions(sensor, measured, view),
         is_height_default=sensor.height == AUTO and not tells_height,
-        doubts=_doubts(sensor, view) if estimates_height else (),
+        doubts=doubts + (_doubts(view) if estimates_height else ()),
     )
 
 
@@ -227,32 +223,24 @@ def with_fallback(pose: SensorPose, fallback: SensorPose, sensor: SensorConfig) 
     """
     if sensor.height != AUTO or pose.is_well_seen:
         return pose
-    return SensorPose(
+    return dataclasses.replace(
+        given_pose(sensor),
         height=fallback.height,
         roll=fallback.roll if sensor.roll == AUTO else sensor.roll,
         pitch=fallback.pitch if sensor.pitch == AUTO else sensor.pitch,
         measured=fallback.measured,
         contradictions=pose.contradictions,
+        is_height_default=False,
         is_fallback=True,
     )
 
 
-def _doubts(sensor: SensorConfig, view: View) -> tuple[str, ...]:
+def _doubts(view: View) -> tuple[str, ...]:
     """Say why the height of the plane of `view` may not be that of the ground."""
     plane = view.plane
-    is_little = plane.n_support < FEW_CELLS or plane.coverage < MIN_COVERAGE
-    clearance = plane.near_height * plane.normal[2] + _product(view.up, origin_of(sensor))
-    is_low = 0.0 < clearance < LOW and plane.depression >= LEAST_DEPRESSION
+    is_low = plane.near_height * plane.normal[2] < LOW and plane.depression >= LEAST_DEPRESSION
     # A boolean of numpy does not multiply a tuple.
-    return (LOW_GROUND,) * bool(is_low) + (LITTLE_GROUND,) * bool(is_little)
-
-
-@lru_cache(maxsize=4)
-def origin_of(sensor: SensorConfig) -> Direction:
-    """Place of the sensor in the frame levelled by `given_pose` [m]."""
-    place = given_pose(sensor).rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)
-    x, y, z = place.tolist()
-    return x, y, z
+    return (LOW_GROUND,) * bool(is_low) + (LITTLE_GROUND,) * (not view.is_whole)
 
 
 def _levelled(up: Direction, sensor: SensorConfig) -> tuple[float, float]:
@@ -272,27 +260,13 @@ def _angle(a: Direction, b: Direction) -> float:
     return math.acos(min(max(_product(a, b), -1.0), 1.0))
 
 
-def _shows_level(candidates: Candidates, level: Plane, view: View) -> bool:
-    """Whether a scan shows a level plane as well, beside that of `view`."""
-    found = plane_across(view.up, view.plane.near_height * view.plane.normal[2])
-    support, support_found = supports_in(candidates, [level, found])
-    return bool(support >= ALSO_SEEN * support_found)
-
-
-def _contradictions(
-    candidates: Candidates,
-    sensor: SensorConfig,
-    measured: MeasuredPose,
-    view: View,
-    level: Direction,
-) -> tuple[str, ...]:
-    """Say which parameters are clearly wrong; `level` is the vertical of the pose used."""
+def _contradictions(sensor: SensorConfig, measured: MeasuredPose, view: View) -> tuple[str, ...]:
+    """Say which parameters are clearly wrong: another level that is seen as well may be meant."""
     found = []
-    tells_height = measured.tells_height and is_well_supported(measured.plane)
-    if tells_height and sensor.height != AUTO:
-        difference = abs(sensor.height - measured.height)
-        is_far = difference > max(HEIGHT_CONTRADICTION, 0.1 * abs(sensor.height))
-        if is_far and not _shows_level(candidates, plane_across(level, sensor.height), view):
+    if view.is_surface and view.is_well_supported and sensor.height != AUTO:
+        most = max(HEIGHT_CONTRADICTION, 0.1 * abs(sensor.height))
+        seen = (measured.height, measured.other_height)
+        if not any(abs(sensor.height - height) <= most for height in seen):
             side = 'below' if measured.height >= 0.0 else 'above'
             found.append(
                 f'sensor.height = {sensor.height:g}: the ground near the sensor is '

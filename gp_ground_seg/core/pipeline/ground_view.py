@@ -1,0 +1,243 @@
+"""Stage 2: what a plane of a scan tells: the height, the tilt, or that z is not up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from gp_ground_seg.core.frame import FloatArray, Scan, as_index
+from gp_ground_seg.core.pipeline.ground_plane import FARTHEST, GroundPlane, tolerance_at
+from gp_ground_seg.core.pipeline.points import Direction, angles_of, rotation, turned_back
+
+MIN_SUPPORT = 0.35
+"""Share of the lowest points on the plane from which a scan determines the tilt."""
+MIN_NEAR_SUPPORT = 0.5
+"""Share of their weight that does as well: on a dike most of them lie below it, far away."""
+MIN_CELLS = 12
+"""Points on the plane from which it is ground for sure."""
+MIN_CLEARANCE, MIN_SPREAD = 0.05, 0.06
+"""Height of the sensor over the plane [m], and spread of the angles of depression of these points
+[rad], for the same: more than one beam."""
+MIN_DEPTH = 2.5
+"""Points on it one behind the other (`GroundPlane.depth`) that do without both: the lowest beam on
+walls, or a scan of one beam, gives one or two, 2.3 in a corridor; ground gives three and more."""
+CONE_SPREAD = 0.025
+"""Spread [rad] below which what looks like a plane is one beam on walls."""
+FEW_CELLS = 45
+"""Cells on the plane below which its height is doubtful. Whole scans that show the height have
+more; parts of a scan, up to 60 degrees wide, have fewer, or less than `MIN_COVERAGE` of the
+sectors."""
+MIN_COVERAGE = 0.25
+"""Share of the sectors with ground in them from which a scan determines the tilt."""
+MIN_REACH = 5.0
+"""Range that the ground must reach for the same [m]."""
+OVERHUNG = 0.75
+"""`GroundPlane.overhung` from which a plane may be that of a reflected ceiling."""
+
+MAX_TILT = math.radians(46.0)
+"""Angle from an axis within which a plane is searched; such cones about the six axes cover all
+directions. A scan whose ground is farther from z than that is not levelled but refused."""
+STEEP = math.radians(25.0)
+"""Tilt from which a plane is fitted again in a frame in which it is level: lowest points of a
+tilted frame are not all ground."""
+GOOD_SUPPORT, TALL = 0.9, 6.0
+"""Support below which a plane this far below z may well be a facade [m]."""
+SUPPORT_RATIO = 0.8
+"""Least support of a plane about another axis over that of the plane below z."""
+OTHER_MIN_SUPPORT, OTHER_MIN_REACH = 0.5, 10.0
+"""Support of it, and range that it reaches [m]: walls and ceilings of rooms seldom do."""
+CLEAR = 0.3
+"""Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
+seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
+
+COLUMN = 0.2, 0.6
+"""Heights over a return between which the next one of a column is looked for [m]."""
+COLUMNS, COLUMNS_REACH = 0.55, 20.0
+"""Share of the candidates on a plane, up to this range [m], that have one, from which the plane is
+that of lower ends, unless the others lie on a floor: of whole scans outdoors the most was 0.37, of
+cut ones mostly 0.6 to 1."""
+FLOOR_SCATTER = 0.025
+"""Distance of the quartiles of these others, or of all, up to which they lie on a floor [m]: 0.003
+to 0.02 in crowded rooms and corridors, 0.03 to 0.15 where the ground was cut away."""
+CUT_TILT = 0.08
+"""Tilt [rad] from which a plane is not that at which ground was cut away."""
+FLOOR_SHARE = 0.1
+"""Share of all that these others are then, at least."""
+LOWER_ENDS = (
+    'the lowest returns are the lower ends of objects: the ground is not seen, or was cut away '
+    'before, by a crop box or a pass-through filter'
+)
+FAR_OFF, TINY, HUGE = 10.0, 0.5, 200.0
+"""Range of the nearest hundredth of the returns [m] from which the origin is not the sensor. Range
+of nearly all [m] below which a cloud is not in metres; of half of them, above which it is not, if
+the farthest are ten times as far as the nearest."""
+
+_QUARTER = math.pi / 2.0
+UPRIGHT, *OTHER_AXES = (
+    rotation(*angles)
+    for angles in (
+        (0.0, 0.0), (math.pi, 0.0), (_QUARTER, 0.0), (-_QUARTER, 0.0), (0.0, _QUARTER),
+        (0.0, -_QUARTER),
+    )
+)  # fmt: skip
+"""Rotations (3, 3) that turn z up, and each of the five other axes."""
+
+
+class View(NamedTuple):
+    """A plane of a scan, seen from a frame in which it may be level."""
+
+    plane: GroundPlane
+    turn: FloatArray  # (3, 3) rotation to that frame from the one levelled by the parameters
+    is_mirror: bool = False  # whether what is below it are mirror images
+
+    @property
+    def up(self) -> Direction:
+        """Normal of the plane, in the frame levelled by the parameters."""
+        return turned_back(self.plane.normal, self.turn)
+
+    @property
+    def levelled(self) -> FloatArray:
+        """Rotation (3, 3) as `turn`, to a frame in which the plane is level."""
+        return rotation(*angles_of(self.up))
+
+    @property
+    def is_steep(self) -> bool:
+        """Whether the plane is clearly tilted against the frame that it was fitted in."""
+        return self.plane.normal[2] < math.cos(STEEP)
+
+    @property
+    def is_well_supported(self) -> bool:
+        """Whether enough of the lowest points lie on it to level a scan by it."""
+        plane = self.plane
+        is_wide = plane.support >= MIN_SUPPORT or plane.near_support >= MIN_NEAR_SUPPORT
+        return is_wide or self.is_mirror
+
+    @property
+    def may_be_image(self) -> bool:
+        """Whether it may be a mirror image, as of the ceiling in a polished floor."""
+        return self.plane.overhung >= OVERHUNG or not self.is_well_supported
+
+    @property
+    def is_surface(self) -> bool:
+        """Whether it is ground for sure: seen at several angles, or several rows deep."""
+        plane = self.plane
+        is_wide = plane.support >= MIN_SUPPORT and plane.coverage >= MIN_COVERAGE
+        return plane.n_support >= MIN_CELLS and (
+            (plane.height >= MIN_CLEARANCE and plane.spread >= MIN_SPREAD)
+            or (is_wide and plane.depth >= MIN_DEPTH)
+        )
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether so much of it is seen that it is not doubtful."""
+        plane = self.plane
+        return self.is_surface and plane.n_support >= FEW_CELLS and plane.coverage >= MIN_COVERAGE
+
+    @property
+    def tells_height(self) -> bool:
+        """Whether it may be ground: for sure, or seen at more than one angle, or over another."""
+        plane = self.plane
+        is_seen = plane.spread >= CONE_SPREAD or not math.isnan(plane.other_height)
+        return self.is_surface or (is_seen and plane.height >= MIN_CLEARANCE)
+
+    @property
+    def tells_tilt(self) -> bool:
+        """Whether it is enough ground to tell the tilt."""
+        is_wide = self.plane.coverage >= MIN_COVERAGE and self.plane.reach >= MIN_REACH
+        return self.is_surface and self.is_well_supported and is_wide
+
+    @property
+    def can_level(self) -> bool:
+        """Whether it is enough ground to level the scan by, and z not too far from its normal."""
+        return self.tells_tilt and self.up[2] >= math.cos(MAX_TILT)
+
+
+def is_ceiling(plane: GroundPlane, scan: Scan) -> bool:
+    """Whether a plane is not below the sensor, nor most of the rest of the scan above it."""
+    if plane.height >= MIN_CLEARANCE:
+        return False
+    height = plane.below(*scan.xyz[scan.grid.r < FARTHEST].T.astype(np.float64))
+    return bool(np.count_nonzero(height > CLEAR) <= np.count_nonzero(height < -CLEAR))
+
+
+def is_doubtful(below: View | None) -> bool:
+    """Whether the plane below z is so poor, or so far away, that z may not be up."""
+    if below is None or below.is_steep or not below.is_well_supported:
+        return True
+    return below.plane.height > TALL and below.plane.support < GOOD_SUPPORT
+
+
+def clearest(below: View | None, others: Iterable[View]) -> View | None:
+    """Return the one of `others` that clearly is the ground, if `below`, about z, is not."""
+    support = SUPPORT_RATIO * below.plane.support if below is not None else 0.0
+    found = [
+        view
+        for view in others
+        if view.tells_tilt
+        # No ground is above the sensor: roofs of cars, of whose ground little is seen, are.
+        and -MIN_CLEARANCE <= view.plane.height <= TALL
+        and view.plane.support >= max(support, OTHER_MIN_SUPPORT)
+        and view.plane.reach >= OTHER_MIN_REACH
+    ]
+    return max(found, key=lambda view: view.plane.support, default=below)
+
+
+@np.errstate(invalid='ignore', over='ignore')
+def objection_to_ground(scan: Scan, view: View | None) -> str:
+    """Return why a scan that shows this plane, or none, has no ground, or ''."""
+    if view is not None and view.turn is UPRIGHT and _shows_lower_ends(view.plane, scan):
+        return LOWER_ENDS
+    r = scan.grid.r if view is None or not view.is_surface else scan.grid.r[:0]
+    r = r[np.isfinite(r)]
+    if len(r) == 0:
+        return ''
+    nearest, middle, farthest = np.quantile(r, (0.01, 0.5, 0.99)).tolist()
+    if farthest < TINY or (middle > HUGE and farthest > FAR_OFF * nearest):
+        return f'half of the returns are within {middle:.3g} m: the cloud is not in metres'
+    if nearest > FAR_OFF:
+        return (
+            f'the nearest returns are {nearest:.0f} m away: the origin of the cloud is not the '
+            'sensor; give its place (sensor.origin_x, ..., the VIEWPOINT of a PCD file)'
+        )
+    return ''
+
+
+def _shows_lower_ends(plane: GroundPlane, scan: Scan) -> bool:
+    """Whether most of what lies on a plane is lower ends of columns, and the rest is no floor."""
+    if plane.normal[2] < math.cos(CUT_TILT):
+        return False
+    candidates, tiles = scan.candidates, scan.tiles
+    height = plane.below(candidates.x, candidates.y, candidates.z)
+    tolerance = np.where(candidates.r < COLUMNS_REACH, tolerance_at(candidates.r), 0.0)
+    is_near, (low, high) = np.abs(height) < tolerance, COLUMN
+    height, tile = height[is_near], as_index(candidates.tile[is_near])
+    enough = COLUMNS * len(tile)
+    if np.count_nonzero((tiles.extremes[:, 1] - tiles.extremes[:, 0])[tile] > low) <= enough:
+        return False
+    over = plane.below(*scan.xyz.T)
+    has_next = np.zeros(len(tiles.extremes), dtype=np.bool_)
+    has_next[tiles.tile[(over > low) & (over < high) & (tiles.tile >= 0)]] = True
+    alone = height[~has_next[tile]]
+    if len(tile) - len(alone) <= enough:
+        return False
+    floors = [z for z in (height, alone) if len(z) > FLOOR_SHARE * len(tile)]
+    scatter = [np.subtract(*np.quantile(z, (0.75, 0.25))) for z in floors]
+    return bool(min(scatter, default=np.inf) > FLOOR_SCATTER)
+
+
+def refusal(view: View, given: FloatArray) -> str:
+    """One line on where the ground is; `given` is the rotation (3, 3) by the parameters."""
+    up = given.T @ view.up
+    roll, pitch = (round(angle, 3) + 0.0 for angle in angles_of(up))
+    largest = int(np.argmax(np.abs(up)))
+    axis = f'{"-" if up[largest] < 0.0 else ""}{"xyz"[largest]}'
+    tilt = math.degrees(math.acos(min(up[2], 1.0)))
+    problem = f'z is tilted by {tilt:.0f} degrees' if axis == 'z' else 'z does not point up'
+    height = view.plane.height * view.plane.normal[2]
+    return (
+        f'{problem}: the ground seems to be {height:.2f} m away with {axis} up; turn '
+        f'the cloud, or set sensor.roll to {roll:.3f} and sensor.pitch to {pitch:.3f} [rad]'
+    )
