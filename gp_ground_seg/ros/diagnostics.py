@@ -226,7 +226,7 @@ def _pose_values(pose: SensorPose) -> dict[str, str]:
         values[f'Sensor {name} ({unit})'] = f'{getattr(pose, name):.4f}'
         shown = getattr(seen, name) if is_shown else None
         values[f'Estimated {name} ({unit})'] = _digits(shown, '.4f')
-    values['Height over another level (m)'] = _digits(seen and seen.other_height, '.4f')
+    values['Height over another level (m)'] = _digits(seen.other_height if seen else None, '.4f')
     return {**values, 'Taken from the scan': ' '.join(taken) or 'nothing'}
 
 
