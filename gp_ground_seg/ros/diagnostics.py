@@ -303,4 +303,4 @@ class Diagnostics:
 
 
 def _digits(value: float | None, form: str) -> str:
-    return 'unknown' if value is None or value != value else format(value, form)
+    return 'unknown' if value in (None, np.inf) else format(value, form)

@@ -193,8 +193,8 @@ class GroundPlane(NamedTuple):
     # share of the sectors with any cell whose nearest is clearly over it, and below the sensor
     overhung: float = 0.0
     n_support: int = 0  # how many cells lie on it
-    # as `height`, of the parallel level with the next best score [m]; NaN if there is none
-    other_height: float = math.nan
+    # as `height`, of the parallel level with the next best score [m]; infinite if there is none
+    other_height: float = math.inf
 
     @property
     def depth(self) -> float:
@@ -260,7 +260,7 @@ SPREAD = _spread(N_TRIPLES)
 
 @shared
 def own_level(cells: LowestPoints, n: int, max_slope: float) -> tuple[Plane, float, float]:
-    """Plane of the level that the robot stands on, its score or 0, and another's height or NaN.
+    """Plane of the level that the robot stands on, its score or 0, and another's height or inf.
 
     It is the plane with the best score, or a parallel one over it that is not refuted and lies
     around the robot: the top of a dock, of which less is seen than of what lies below it.
@@ -269,7 +269,7 @@ def own_level(cells: LowestPoints, n: int, max_slope: float) -> tuple[Plane, flo
     supports = supports_of(planes, cells)
     best, score, _ = best_of(planes, supports, cells, n, 0.0)
     if score <= 0.0:
-        return best, 0.0, math.nan
+        return best, 0.0, math.inf
     height, slope_x, slope_y = planes[:, 0], planes[:, 1], planes[:, 2]
     if 0.0 < math.hypot(best[1], best[2]) < STRAIGHT:
         levels = np.where(np.hypot(slope_x, slope_y) == 0.0, supports, 0.0)
@@ -285,7 +285,7 @@ def own_level(cells: LowestPoints, n: int, max_slope: float) -> tuple[Plane, flo
     levels = np.where(is_parallel & (height > best[0] + APART), supports, 0.0)
     under, under_score, _ = best_of(planes, levels, cells, n, OTHER_SHARE * score)
     other = over if over_score > under_score else under
-    return best, score, other[0] if max(over_score, under_score) > 0.0 else math.nan
+    return best, score, other[0] if max(over_score, under_score) > 0.0 else math.inf
 
 
 @shared

@@ -140,7 +140,7 @@ class View(NamedTuple):
     def tells_height(self) -> bool:
         """Whether it may be ground: for sure, or seen at more than one angle, or over another."""
         plane = self.plane
-        is_seen = plane.spread >= CONE_SPREAD or not math.isnan(plane.other_height)
+        is_seen = plane.spread >= CONE_SPREAD or math.isfinite(plane.other_height)
         return self.is_surface or (is_seen and plane.height >= MIN_CLEARANCE)
 
     @property

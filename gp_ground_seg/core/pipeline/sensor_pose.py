@@ -67,8 +67,8 @@ class MeasuredPose:
     tells_tilt: bool  # the same for the tilt
     # in the frame levelled by the angles given, or where that is far from level in its own
     plane: GroundPlane
-    # as `height`, over another level that is seen, higher or lower; NaN if there is none [m]
-    other_height: float = math.nan
+    # as `height`, over another level that is seen, higher or lower; infinite if there is none [m]
+    other_height: float = math.inf
 
 
 @dataclass(frozen=True)
