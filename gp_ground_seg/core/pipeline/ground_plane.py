@@ -83,7 +83,7 @@ LOOSER = 1.1
 RESOLUTION = 4096.0
 """Support by a point at `MIDDLE` exactly on a plane; that of each is a whole number, so that sums
 are exact."""
-N_REFINEMENTS = 12
+N_REFINEMENTS = 13
 MIN_CELLS = 3
 
 
