@@ -49,7 +49,7 @@ def wait_for(browser, condition):
     """Return the first value of `condition`, given the text of the page, that is true."""
     from selenium.webdriver.support.wait import WebDriverWait
 
-    text = 'return document.body.innerText'
+    text = 'return document.body ? document.body.innerText : ""'  # none yet while it loads
     return WebDriverWait(browser, PATIENCE, 0.1).until(
         lambda driver: condition(driver.execute_script(text))
     )
