@@ -25,8 +25,9 @@ from gp_ground_seg.core.pipeline.ground_plane import GroundPlane, tolerance_at
 from gp_ground_seg.core.pipeline.low_sensor import is_seen_from_sensor
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
-DEEP = 0.15
-"""Depth below the plane from which a return may be an image [m]: more than that of a kerb."""
+DEEP, DEEPEST = 0.15, 10.0
+"""Depth below the plane from which a return may be an image [m], more than that of a kerb; and up
+to which images are asked for what they are images of."""
 OVER_SIGHT = 0.05
 """Height up to which a ray to an image passes over ground that is seen nearer [m]: noise. Of rays
 that meet the road side by side some come back from it, others from what they are mirrored to."""
@@ -104,7 +105,7 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     candidates = scan.candidates
     over = plane.below(candidates.x, candidates.y, candidates.z)
     near = (candidates.r >= NEAREST) & (candidates.r < WET_REACH)
-    deep = np.flatnonzero(near & (over < -DEEP))
+    deep = np.flatnonzero(near & (over < -DEEP) & (over > -DEEPEST))
     is_on_it = near & (np.abs(over) <= tolerance_at(candidates.r))
     if len(deep) <= WET_SHARE * np.count_nonzero(is_on_it):
         return 0.0
