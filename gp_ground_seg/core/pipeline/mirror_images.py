@@ -26,8 +26,7 @@ from gp_ground_seg.core.pipeline.low_sensor import is_seen_from_sensor
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
 DEEP, DEEPEST = 0.15, 10.0
-"""Depth below the plane from which a return may be an image [m], more than that of a kerb; and up
-to which images are asked for what they are images of."""
+"""Depths below the plane at which a return may be an image [m]: more than that of a kerb."""
 OVER_SIGHT = 0.05
 """Height up to which a ray to an image passes over ground that is seen nearer [m]: noise. Of rays
 that meet the road side by side some come back from it, others from what they are mirrored to."""
