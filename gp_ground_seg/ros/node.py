@@ -34,20 +34,13 @@ from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
+from gp_ground_seg.ros.arguments import initialize, start_errors, unused_files, with_file
 from gp_ground_seg.ros.diagnostics import Diagnostics, kept_height
 from gp_ground_seg.ros.input import STEADY_CLOCK, THROTTLED, CloudSubscription
 from gp_ground_seg.ros.loader import CHANGED, FOLLOWS, STAYS, BackendLoader
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
-from gp_ground_seg.ros.session import (
-    StopRequest,
-    initialize,
-    large_cloud_transport,
-    start_errors,
-    stop_on_signals,
-    unused_files,
-    with_file,
-)
+from gp_ground_seg.ros.session import StopRequest, large_cloud_transport, stop_on_signals
 from gp_ground_seg.ros.transforms import (
     CloudFrames,
     FrameListener,

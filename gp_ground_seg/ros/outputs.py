@@ -38,9 +38,9 @@ MODEL_FIELDS = (
     'x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch', 'origin_x', 'origin_y',
     'origin_z',
 )  # fmt: skip
-"""Fields of ``~/ground_model``, all float32 [m, rad]. The last three locate a place in the grid:
-the horizontal range of the knot in the level frame, and the angles, equal in all points, that turn
-the cloud's frame into the level one."""
+"""Fields of ``~/ground_model``, all float32 [m, rad]. The last six locate a place in the grid: the
+horizontal range of the knot in the level frame, and, equal in all points, the angles that turn the
+cloud's frame into the level one, and the place of the sensor in it."""
 OUTPUT_DEPTH = 20  # messages kept: Fast DDS may send a lost fragment again after 0.7 s only
 LONGEST_PERIOD = 1.0
 """Time between two clouds [s] from which on some are missing: ``scan_time`` is 0 then."""

@@ -17,8 +17,8 @@ from rclpy.qos import qos_profile_parameters
 from gp_ground_seg.core.errors import ConfigError, GroundSegError
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.schema import OF_EVERY_NODE, ParameterSpec
+from gp_ground_seg.ros.arguments import start_errors
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
-from gp_ground_seg.ros.session import start_errors
 
 _NAMES = frozenset(spec.name for spec in parameter_specs())
 

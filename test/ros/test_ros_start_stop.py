@@ -14,8 +14,9 @@ from cli_runner import children, is_running, stat_words
 from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 
 from gp_ground_seg.core.jit import HAVE_NUMBA
+from gp_ground_seg.ros.arguments import unused_files
 from gp_ground_seg.ros.node import main
-from gp_ground_seg.ros.session import ROS_WHEELS, ros_session, stop_on_signals, unused_files
+from gp_ground_seg.ros.session import ROS_WHEELS, ros_session, stop_on_signals
 
 FIXED = (*IN_NAMESPACE, *ros.given({'learning.mode': 'fixed'}))
 QOS = 'qos_overrides./points.subscription'

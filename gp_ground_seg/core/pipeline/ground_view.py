@@ -54,18 +54,19 @@ CLEAR = 0.3
 seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
 
 COLUMN = 0.2, 0.6
-"""Heights over a return between which the next one of a column is looked for [m]."""
+"""Heights over the plane between which a column is looked for over what lies on it [m]."""
 COLUMNS, COLUMNS_REACH = 0.55, 20.0
-"""Share of the candidates on a plane, up to this range [m], that have one, from which the plane is
-that of lower ends, unless the others lie on a floor: of whole scans outdoors the most was 0.37, of
-cut ones mostly 0.6 to 1."""
+"""Share of the candidates on a plane, up to this range [m], with a column over them, from which
+they are lower ends, unless there is a floor: of whole scans outdoors the most was 0.37, of cut
+ones mostly 0.6 to 1."""
 FLOOR_SCATTER = 0.025
-"""Distance of the quartiles of these others, or of all, up to which they lie on a floor [m]: 0.003
-to 0.02 in crowded rooms and corridors, 0.03 to 0.15 where the ground was cut away."""
+"""Distance of the quartiles of the heights of all candidates on the plane, or of those without a
+column, up to which they lie on a floor [m]: 0.003 to 0.02 in crowded rooms and corridors, 0.03 to
+0.15 where the ground was cut away."""
 CUT_TILT = 0.08
 """Tilt [rad] from which a plane is not that at which ground was cut away."""
 FLOOR_SHARE = 0.1
-"""Share of all that these others are then, at least."""
+"""Least share of the candidates without a column that may show a floor by themselves."""
 LOWER_ENDS = (
     'the lowest returns are the lower ends of objects: the ground is not seen, or was cut away '
     'before, by a crop box or a pass-through filter'
