@@ -39,7 +39,7 @@ COMMANDS = {
     'plot': ('plot', 'draw a scan in perspective, or a segment of it from the side'),
     'tune': ('tune', 'set parameters by sliders, and see the labels change'),
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
-    'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
+    'experiment': ('evaluate', 'repeat an experiment of docs/, such as ablation'),
 }
 EXAMPLES = """\
 `gp-ground-seg COMMAND --help` explains a command.

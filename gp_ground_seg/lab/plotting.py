@@ -28,8 +28,6 @@ COLOURS = {
     'ground': '#B9BFC6',
     'obstacle': '#D55E00',
     'unknown': '#E3E6E9',
-    'not scored': '#E3E6E9',
-    'right': '#BCC2C8',
     'missed ground': '#0072B2',
     'false ground': '#AA3377',
 }

@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -37,67 +37,40 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.inputs import Input, Inputs
 from gp_ground_seg.data.semantic_kitti import read_entries
 from gp_ground_seg.lab.plotting import CAMERA, COLOURS, GREEN, TARGET
-from gp_ground_seg.lab.scoring.metrics import Labels, count_labels, label_ratios, true_labels
-from gp_ground_seg.lab.scoring.objects import Objects, count_objects, labelled_objects
+from gp_ground_seg.lab.scoring.evaluate import KnownScan, labelled_scan, score_scan
+from gp_ground_seg.lab.scoring.metrics import Labels, label_ratios
 
 Colours = npt.NDArray[np.uint8]
 BLACK = '#111111'
 LEGENDS = {
     'class': {name: COLOURS[name] for name in ('unknown', 'ground', 'obstacle')},
     'changes': {'now ground': GREEN, 'now obstacle': BLACK},
-    'errors': {
-        name: COLOURS[name] for name in ('not scored', 'right', 'missed ground', 'false ground')
-    },
+    'errors': {name: COLOURS[name] for name in ('false ground', 'missed ground')},
 }
-"""Ways to colour the points, and what their colours mean; changes have those of the class too."""
+"""Ways to colour the points, and what their colours mean; all have those of the class too."""
 
 
-class View(NamedTuple):
-    """A scan to look at, with its true labels and objects where they are known."""
-
-    points: npt.NDArray[np.floating]  # (N, >=3)
-    truth: Labels | None = None  # (N,) true `Label`; UNKNOWN does not count
-    objects: Objects | None = None
-
-    def scores(self, label: Labels) -> dict[str, float]:
-        """Return IoU [%], objects lost and objects; nothing where the truth is not known."""
-        if self.truth is None or self.objects is None:
-            return {}
-        rows = count_objects(self.points, label, self.objects)
-        n_lost, n_objects = (sum(row[name] for row in rows) for name in ('n_lost', 'n_objects'))
-        iou = 100.0 * label_ratios(count_labels(label, self.truth))['iou']
-        return {'IoU': iou, 'lost': n_lost, 'objects': n_objects}
-
-
-def read_view(item: Input, labels: str | None = None) -> View:
+def read_view(item: Input, labels: str | None = None) -> KnownScan:
     """Read a scan, and its labels: a file, or what SemanticKITTI has beside the scan."""
     points, path = item.read().xyz, labels
     beside = item.path.parent.parent / 'labels' / f'{item.name}.label'
     if path is None and item.path.parent.name == 'velodyne' and beside.exists():
         path = str(beside)
     if path is None:
-        return View(points)
-    entries = read_entries(path, len(points))
-    truth = true_labels(entries & 0xFFFF)
-    objects = labelled_objects(points, entries, truth == Label.GROUND)
-    return View(points, truth, objects)
+        return KnownScan('', item.name, points)
+    return labelled_scan('', item.name, points, read_entries(path, len(points)))
 
 
-def point_colours(name: str, result: Segmentation, other: Labels) -> Colours:
+def point_colours(name: str, label: Labels, other: Labels) -> Colours:
     """Colours of all points, (N, 3), by the `name` of a legend.
 
-    It is ``errors`` against `other`, the truth; ``class``; or ``changes``: the class, and where
-    it differs from `other`, what it is now.
+    They are those of the class, and where it differs from `other`, which are labels before or the
+    truth, those of the legend: what it is now, or how it is wrong.
     """
-    is_ground = result.label == Label.GROUND
-    if name == 'errors':
-        kind = np.where(is_ground == (other == Label.GROUND), 1, np.where(is_ground, 3, 2))
-        kind[other == Label.UNKNOWN] = 0
-        return palette(name)[kind]
-    colours = palette('class')[result.label]
-    if name == 'changes':
-        changed = result.label != other
-        colours[changed] = palette(name)[np.where(is_ground[changed], 0, 1)]
+    colours, is_ground = palette('class')[label], label == Label.GROUND
+    if name != 'class':
+        differs = (other != Label.UNKNOWN) & (is_ground != (other == Label.GROUND))
+        colours[differs] = palette(name)[np.where(is_ground[differs], 0, 1)]
     return colours
 
 
@@ -246,7 +219,7 @@ class Tuner:
         self._cloud: Any = None
         self._drawn: object = None
         self._view = lru_cache(maxsize=1)(lambda number: read_view(inputs[number], labels))
-        self._before = lru_cache(maxsize=1)(self._labels_and_scores)
+        self._before = lru_cache(maxsize=1)(self._segment)
 
         gui, last = server.gui, len(inputs) - 1
         # Sharing would send the scan through a server of viser's makers.
@@ -314,23 +287,21 @@ class Tuner:
         self._watch(automatic)
         return lambda: AUTO if automatic.value else slider.value
 
-    def _segment(self, number: int, config: Config) -> Segmentation:
+    def _segment(self, number: int, config: Config) -> tuple[Segmentation, dict[str, Any]]:
+        """Segment a frame; return the result and its sums against the labels."""
         self._segmenter.configure(config)
-        return self._segmenter.segment(self._view(number).points)
-
-    def _labels_and_scores(self, number: int, config: Config) -> tuple[Labels, dict[str, float]]:
-        label = self._segment(number, config).label
-        return label, self._view(number).scores(label)
+        result = self._segmenter.segment(self._view(number).points)
+        return result, score_scan(self._view(number), result)['scans'][0]
 
     def show(self, number: int, name: str, config: Config) -> None:
         """Segment a frame, and draw it in the colours of that name."""
-        before, old_scores = self._before(number, self._reference)
-        result, view = self._segment(number, config), self._view(number)
-        other = view.truth if name == 'errors' else before
+        (before, sums_before), view = self._before(number, self._reference), self._view(number)
+        result, sums = self._segment(number, config)
+        other = view.truth if name == 'errors' else before.label
         if other is None:
-            name, other = 'changes', before
+            name, other = 'changes', before.label
         finite = result.label != Label.UNKNOWN
-        colours = point_colours(name, result, other)[finite]
+        colours = point_colours(name, result.label, other)[finite]
         drawn = number, result.pose.roll, result.pose.pitch
         with self._server.atomic():
             if drawn == self._drawn:
@@ -343,10 +314,8 @@ class Tuner:
                     point_shading='flat',
                 )  # fmt: skip
                 self._drawn = drawn
-            names = ['class', name] if name == 'changes' else [name]
-            self._legend.content = box(legend(names))
-            scores = view.scores(result.label), old_scores
-            self._table.content = _table(result, before, scores)
+            self._legend.content = box(legend(dict.fromkeys(['class', name])))
+            self._table.content = _table(result, before.label, (sums, sums_before))
 
 
 def _tell(place: Any, action: Callable[[], str | None]) -> None:
@@ -359,16 +328,16 @@ def _tell(place: Any, action: Callable[[], str | None]) -> None:
     place.content = box(html.escape(words)) if words else ''
 
 
-def _table(result: Segmentation, before: Labels, scores: Sequence[dict[str, float]]) -> str:
+def _table(result: Segmentation, before: Labels, sums: Sequence[dict[str, Any]]) -> str:
     """Numbers of a result and of labels before, and how many labels have changed."""
     both = result.label, before
     rows = {
         word: [in_thousands(np.count_nonzero(label == value)) for label in both]
         for word, value in (('ground', Label.GROUND), ('obstacle', Label.OBSTACLE))
     }
-    if scores[0]:
-        rows['IoU'] = [f'{score["IoU"]:.2f} %' for score in scores]
-        rows['objects lost'] = [f'{score["lost"]} of {score["objects"]}' for score in scores]
+    if 'tp' in sums[0]:
+        rows['IoU'] = [f'{100.0 * label_ratios(own)["iou"]:.2f} %' for own in sums]
+        rows['objects lost'] = [f'{own["n_lost"]} of {own["n_objects"]}' for own in sums]
     rows['time'] = [f'{1e3 * result.timings["total"]:.0f} ms', '']
     is_ground = (result.label == Label.GROUND)[result.label != before]
     numbers = len(is_ground), int(is_ground.sum()), int((~is_ground).sum())

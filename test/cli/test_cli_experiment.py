@@ -7,7 +7,7 @@ import pytest
 from cli_runner import error_line, run
 from evaluation_samples import write_streets
 
-from gp_ground_seg.cli.experiment import EXPERIMENTS
+from gp_ground_seg.cli.evaluate import EXPERIMENTS
 from gp_ground_seg.lab import experiments
 from gp_ground_seg.lab.scoring import evaluate as runner
 

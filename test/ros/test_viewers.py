@@ -13,8 +13,10 @@ from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.lab import tuner as page
+from gp_ground_seg.lab.scoring.evaluate import MethodResult, score_scan
 from gp_ground_seg.lab.tuner import (
     Tuner,
+    _table,
     open_server,
     palette,
     point_colours,
@@ -31,26 +33,22 @@ CAR = 10 | 7 << 16  # class of SemanticKITTI, and an instance of it
 def test_colours_are_those_of_the_legends():
     points = simulated('urban').points.copy()
     points[0, 0] = np.nan
-    result = GroundSegmenter().segment(points)
-    label, n = result.label, len(points)
-    by_class = point_colours('class', result, label)
+    label, n = GroundSegmenter().segment(points).label, len(points)
+    by_class = point_colours('class', label, label)
     assert np.array_equal(by_class, palette('class')[label])
     unknown, ground, obstacle = palette('class')
     assert (by_class[0] == unknown).all() and not (ground == obstacle).all()
 
-    before, (white, right, missed, false) = label.copy(), palette('errors')
+    before = label.copy()
     first, second = (np.flatnonzero(label == kind)[0] for kind in (Label.GROUND, Label.OBSTACLE))
     before[[first, second]] = Label.OBSTACLE, Label.GROUND
     others = np.delete(np.arange(n), [0, first, second])
-    for name, changed, same in (
-        ('changes', palette('changes'), by_class[others]),
-        ('errors', [false, missed], right),
-    ):
-        colours = point_colours(name, result, before)
-        assert np.array_equal(colours[[first, second]], changed)
-        assert (colours[others] == same).all()
+    for name in ('changes', 'errors'):
+        colours = point_colours(name, label, before)
+        assert np.array_equal(colours[[first, second]], palette(name))
+        assert np.array_equal(colours[others], by_class[others])
     before[first] = Label.UNKNOWN
-    assert np.array_equal(point_colours('errors', result, before)[first], white)
+    assert np.array_equal(point_colours('errors', label, before)[first], ground)
 
 
 def test_scores_of_labels(tmp_path):
@@ -60,13 +58,15 @@ def test_scores_of_labels(tmp_path):
     points.tofile(tmp_path / 'a.bin')
     np.repeat([ROAD, CAR], [1600, 20]).astype('<u4').tofile(tmp_path / 'b.label')
     (item,) = list_inputs(tmp_path / 'a.bin')
-    assert read_view(item).scores(np.full(1620, 1)) == {}
+    assert read_view(item).truth is None
     view = read_view(item, str(tmp_path / 'b.label'))
-    scores = view.scores(np.full(1620, Label.GROUND, np.uint8))
-    assert (scores['lost'], scores['objects']) == (1, 1)
-    assert scores['IoU'] == pytest.approx(100.0 * 1600 / 1620)
+    result = GroundSegmenter().segment(view.points)
     right = np.repeat([Label.GROUND, Label.OBSTACLE], [1600, 20]).astype(np.uint8)
-    assert view.scores(right) == {'IoU': 100.0, 'lost': 0, 'objects': 1}
+    for label, n_lost, iou in ((np.full(1620, Label.GROUND), 1, 1600 / 1620), (right, 0, 1.0)):
+        (sums,) = score_scan(view, MethodResult(label, result.ground_z))['scans']
+        rows = _table(result, right, [sums, sums]).splitlines()
+        assert f'| objects lost | {n_lost} of 1 | {n_lost} of 1 |' in rows
+        assert f'| IoU | {100.0 * iou:.2f} % | {100.0 * iou:.2f} % |' in rows
 
 
 def test_a_slider_goes_through_accepted_values_and_holds_the_one_at_hand():

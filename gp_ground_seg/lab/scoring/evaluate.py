@@ -134,14 +134,20 @@ def load_kitti(frame: Frame, cut: float = 0.0) -> KnownScan:
         raise DataError(f'{frame.points_path}: has no labels')
     points = read_points(frame.points_path, frame.columns)
     entries = read_entries(frame.labels_path, len(points))
+    return labelled_scan(shown(frame.sequence), shown(frame.index), points, entries, cut)
+
+
+def labelled_scan(
+    sequence: str, index: str, points: Points, entries: npt.NDArray[np.uint32], cut: float = 0.0
+) -> KnownScan:
+    """Return a scan whose truth are the entries of a ``.label`` file, (N,); see `load_kitti`."""
     semantic = (entries & 0xFFFF).astype(np.uint16)
     z = points[:, 2].astype(np.float64)
     truth = metrics.true_labels(semantic)
     is_ground = truth == Label.GROUND
     found = objects.labelled_objects(points, entries, is_ground)
-    names = shown(frame.sequence), shown(frame.index)
     low = objects.cut_objects(points, found.class_of >= 0, is_ground, cut) if cut else None
-    return KnownScan(*names, points, truth, semantic, z, is_ground, found, cut=low)
+    return KnownScan(sequence, index, points, truth, semantic, z, is_ground, found, cut=low)
 
 
 def score_methods(
@@ -196,7 +202,7 @@ def score_rows(
             seconds[method] = time.perf_counter() - start
         results = [method.result() for method in methods]
         for method, other, result in zip(methods, copies, results, strict=True):
-            own = _score(scan, result)
+            own = score_scan(scan, result)
             own['scans'][0] |= {
                 'seconds': seconds[method],
                 'n_changed': int((result.label != results[0].label).sum()),
@@ -225,7 +231,7 @@ def _low_things(scan: KnownScan, method: Method, *, forgets: bool) -> dict[str, 
     return scan.cut.count_ground(method.result().label)
 
 
-def _score(scan: KnownScan, result: MethodResult | Segmentation) -> Rows:
+def score_scan(scan: KnownScan, result: MethodResult | Segmentation) -> Rows:
     """Rows of a scan, by frame. What else is counted of a labelled scan gets its line here."""
     label, rows = result.label, Rows()
     sums: dict[str, Any] = {'cluster': scan.cluster or scan.sequence, 'n_scans': 1}
