@@ -29,11 +29,40 @@ def double(x):
 def half(x):
     return 0.5 * x
 """
+PROCESSES = """
+import json, logging, os, resource, signal, sys, traceback
+import numba
+from gp_ground_seg.core import jit
+numba.njit(lambda x: x)(1.0)  # what the first compilation imports and fills is shared too
+code = sys.argv[1]
+for line in sys.stdin:
+    started = []
+    for k, (folder, environment, limit) in enumerate(json.loads(line)):
+        if process := os.fork():
+            started.append(process)
+            continue
+        try:
+            for number, name in ((1, 'out'), (2, 'err')):
+                file = open(f'{folder}-{k}.{name}', 'w')
+                os.dup2(file.fileno(), number)
+            os.chdir(folder)
+            os.environ.update(environment)
+            sys.dont_write_bytecode = limit is not None
+            resource.setrlimit(resource.RLIMIT_FSIZE, 2 * [limit or resource.RLIM_INFINITY])
+            exec(code)
+            sys.stdout.flush()
+            os._exit(0)
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
+    ends = [os.waitpid(process, 0)[1] for process in started]
+    print(json.dumps([os.waitstatus_to_exitcode(end) for end in ends]), flush=True)
+"""
+"""Forks a process for each of the folders, environments and limits of a line, so that numba is
+imported once, and prints their exit codes."""
 RUN = """
-import json, logging, os, signal, sys
 logging.basicConfig(level=logging.INFO, stream=sys.stderr, format='%(message)s')
 import small
-from gp_ground_seg.core import jit
 jit._patience = float(os.environ.get('PATIENCE', '60'))
 was_kept = small.is_code_kept()
 assert small.has_to_compile() == (jit.JIT_ENABLED and not was_kept)
@@ -50,30 +79,47 @@ print(json.dumps([result, hits, misses, was_kept, str(folder) if folder else Non
 """
 
 
-class Program:
-    """A module with two compiled functions, run in a process of its own."""
+@pytest.fixture(scope='module')
+def processes():
+    """Runs processes at the same time; returns the exit code of each."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(('NUMBA_', 'XDG_'))}
+    with subprocess.Popen(
+        [sys.executable, '-c', PROCESSES, RUN],
+        env=kept, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    ) as server:  # fmt: skip
 
-    def __init__(self, folder: Path):
+        def run(requests):
+            server.stdin.write(f'{json.dumps(requests)}\n')
+            server.stdin.flush()
+            return json.loads(server.stdout.readline())
+
+        yield run
+
+
+class Program:
+    """A module with two compiled functions, run in processes of their own."""
+
+    def __init__(self, folder: Path, processes):
         self.folder, self.cache = folder, folder / 'cache'
         (folder / 'small.py').write_text(MODULE)
-        self.stderr = ''
+        self._processes, self.stderr = processes, ''
 
     def run(self, limit=None, **environment: str) -> list:
         """What a run says; it writes at most `limit` bytes to a file, as to a full disk."""
-        process = self.start(limit, **environment)
-        said, self.stderr = process.communicate(timeout=120)
-        assert process.returncode == 0, self.stderr
+        (said,) = self.run_some(1, limit, **environment)
         return json.loads(said)
 
-    def start(self, limit=None, **environment: str) -> subprocess.Popen:
+    def run_some(self, n, limit=None, code=0, **environment: str) -> list[str]:
+        """What each of several runs at the same time prints; they end with that code."""
         changed = {'NUMBA_CACHE_DIR': str(self.cache), **environment}
-        kept = {k: v for k, v in os.environ.items() if not k.startswith(('NUMBA_', 'XDG_'))}
-        size = '' if limit is None else f'ulimit -f {limit // 1024}; '
-        return subprocess.Popen(
-            ['bash', '-c', size + 'exec "$@"', '-', sys.executable, '-c', RUN],
-            env=kept | {k: v for k, v in changed.items() if v is not None},
-            cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+        codes = self._processes(n * [(str(self.folder), changed, limit)])
+        texts = {
+            kind: [Path(f'{self.folder}-{k}.{kind}').read_text() for k in range(n)]
+            for kind in ('out', 'err')
+        }
+        self.stderr = ''.join(texts['err'])
+        assert codes == n * [code], self.stderr
+        return texts['out']
 
     def code(self, name: str = 'double', kind: str = 'nbc') -> Path:
         (found,) = self.cache.rglob(f'small.{name}-*.{kind}')
@@ -85,16 +131,16 @@ NOT_KEPT = [42.0, 0, 2, False, None]
 
 
 @pytest.fixture
-def program(tmp_path):
-    tmp_path.chmod(0o755)
-    return Program(tmp_path)
+def program(tmp_path, processes):
+    folder = tmp_path / 'program'
+    folder.mkdir(0o755)
+    return Program(folder, processes)
 
 
 def test_code_is_compiled_once_said_once_and_then_loaded(program):
     """What is compiled is kept although the process is killed then, as a warm-up half way."""
-    with program.start(KILL='1') as process:
-        assert process.wait(timeout=120) == -signal.SIGKILL
-        assert process.stderr.read().count('compiling') == 1
+    program.run_some(1, code=-signal.SIGKILL, KILL='1')
+    assert program.stderr.count('compiling') == 1
     # A command may need a part of the code: nothing of it is missing.
     assert program.run(PART='1')[:4] == [42.0, 1, 0, False] and program.stderr == ''
     assert program.run()[:4] == [42.0, 1, 1, False] and program.stderr.count('compiling') == 1
@@ -150,7 +196,7 @@ def test_damaged_code_is_compiled_again_and_that_of_other_functions_loaded(progr
 
 
 def test_a_full_disk_ends_nothing(program):
-    *result, _ = program.run(1024, PYTHONDONTWRITEBYTECODE='1')
+    *result, _ = program.run(1024)
     assert result == COMPILED
     (line,) = [line for line in program.stderr.splitlines() if 'not kept on disk' in line]
     assert 'File too large' in line
@@ -161,8 +207,7 @@ def test_a_full_disk_ends_nothing(program):
 
 
 def test_one_process_compiles_and_others_wait_for_its_files(program):
-    processes = [program.start() for _ in range(3)]
-    found = [json.loads(process.communicate(timeout=120)[0]) for process in processes]
+    found = [json.loads(said) for said in program.run_some(3)]
     assert {result for result, *_ in found} == {42.0}
     assert sum(misses for _, _, misses, *_ in found) == 2
     assert sum(hits for _, hits, *_ in found) == 4

@@ -36,7 +36,9 @@ def labels_of(backend, points):
     """Labels and margins of points (N, 3) over a level surface."""
     config = CONFIG.replace(**{'grid.r_max': 12.0, 'grid.r_min': 1.2})
     mean, std = np.zeros((4, 5)), np.full((4, 5), 0.1)
-    surface = GroundSurface(np.linspace(1.2, 12.0, 5), mean, std, np.ones(0, dtype=bool))
+    knots = np.linspace(1.2, 12.0, 5)
+    knots.setflags(write=False)  # as a frame has them: another type would be compiled by itself
+    surface = GroundSurface(knots, mean, std, np.ones(0, dtype=bool))
     scan = backend.build_grid(points, config)
     return backend.label_points(scan, Faces.none(scan.tiles), surface, LEVEL, config)
 
