@@ -149,7 +149,8 @@ class NumbaBackend:
         n_points = len(scan.xyz)
         result = Labelled(np.empty(n_points, np.uint8), np.empty(n_points), np.empty(n_points))
         labels.label_points(
-            scan,
+            # One type also without a point: another would be compiled, for seconds, when it comes.
+            scan._replace(xyz=scan.xyz.T),
             faces,
             surface,
             relief,

@@ -65,8 +65,9 @@ def label_points(
 ) -> None:
     """Height, label and margin of each point, into `result`.
 
-    `is_level` says whether the relief is level; `depth`, `units` and `lowest` are those of
-    `depth_of_ground`, `sum_units` and `lowest_of`; `by_roughness` is the rule of the parameters.
+    Here `Scan.xyz` is (3, N). `is_level` says whether the relief is level; `depth`, `units` and
+    `lowest` are those of `depth_of_ground`, `sum_units` and `lowest_of`; `by_roughness` is the
+    rule of the parameters.
     """
     tiles, n_tiles = scan.tiles, len(scan.tiles.place)
     sums, bands = np.zeros((n_tiles + 1, 2), np.int64), np.zeros(n_tiles + 1)
@@ -114,7 +115,7 @@ def _survey(
 
     For `pieces` see `_fit_pieces`, for `sums` `gp_ground_seg.core.compiled.roughness`.
     """
-    x, y, tile = scan.xyz.T[0], scan.xyz.T[1], scan.tiles.tile
+    x, y, tile = scan.xyz[0], scan.xyz[1], scan.tiles.tile
     land = relief.pieces.reshape(-1, 4)
     u, v, piece = np.zeros(BLOCK), np.zeros(BLOCK), np.zeros(BLOCK, np.int32)
     for first in range(0, len(tile), BLOCK):
@@ -137,7 +138,7 @@ def _measure(
     height: FloatArray,
 ) -> None:
     """Heights of the points of a block over the surface and the land."""
-    z, r, cell = scan.xyz.T[2][block], scan.grid.r[block], scan.grid.cell[block]
+    z, r, cell = scan.xyz[2][block], scan.grid.r[block], scan.grid.cell[block]
     nearest, outside = scan.grid.edges[0], len(pieces) - 1
     for i in range(len(height)):
         c = np.uintp(cell[i] if cell[i] >= 0 else outside)
@@ -174,7 +175,7 @@ def _label_by_bands(
     Ground reaches `depth` below the surface, and `bands` (T + 1,) above it [m]. `has_obstacle`
     becomes true where a return near the surface is no ground.
     """
-    z, tile, cell = scan.xyz.T[2], scan.tiles.tile, scan.grid.cell
+    z, tile, cell = scan.xyz[2], scan.tiles.tile, scan.grid.cell
     is_face, is_occluded, extremes = faces.is_face, faces.has_occluded_base, scan.tiles.extremes
     height, label, margins = result.height, result.label, result.margin
     for i in range(len(tile)):
@@ -267,7 +268,7 @@ def _count_votes(
     Returns the voters in tiles with an obstacle, and the place of the layer of each in `votes`.
     """
     tolerance, n = config.ground_tolerance, 0
-    z, tile = scan.xyz.T[2], scan.tiles.tile
+    z, tile = scan.xyz[2], scan.tiles.tile
     voters, places = np.empty(len(tile), np.int32), np.empty(len(tile), np.int32)
     for i in range(len(tile)):
         row = rows[np.uintp(tile[i] if tile[i] >= 0 else len(rows) - 1)]
