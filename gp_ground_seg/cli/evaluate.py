@@ -185,10 +185,10 @@ def run_evaluate(arguments: argparse.Namespace) -> int:
         ]
         if not changed:
             raise ConfigError(f'--against {arguments.against}: the same parameters as given')
+    items, load = _items(arguments, cut)
     result: list[str] = []
 
     def measured(runner: Runner) -> Report:
-        items, load = _items(arguments, cut)
         scores = score_methods(items, methods, load, runner=runner)
         if changed:
             print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
@@ -209,18 +209,17 @@ def run_experiment(arguments: argparse.Namespace) -> int:
     kind = 'labelled' if is_simulated else 'simulated'
     options.refuse(arguments, others, f'is for {kind} scans')
 
-    def measured(runner: Runner) -> Report:
-        if not is_simulated:
-            return experiment.run(frames_from_options(arguments), config, runner)
-        scans = experiments.simulated_frames(
+    scans: Sequence[Any] = (
+        experiments.simulated_frames(
             arguments.sensors or experiment.sensors,
             arguments.scenes or experiment.scenes,
             arguments.seeds or experiment.n_seeds,
             experiment.places,
         )
-        return experiment.run(scans, config, runner)
-
-    print_report(arguments, name, measured, experiment=name)
+        if is_simulated
+        else frames_from_options(arguments)
+    )
+    print_report(arguments, name, partial(experiment.run, scans, config), experiment=name)
     return 0
 
 

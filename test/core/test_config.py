@@ -141,9 +141,10 @@ def test_forms_agree_and_no_change_but_in_a_copy(config, other):
     assert config.replace() == config
     assert config.flat() == flat
     assert list(flat) == [spec.name for spec in SPECS]
+    nested = config.nested()
     for name, value in flat.items():
         group, field = name.split('.')
-        assert config[name] == config.nested()[group][field] == value
+        assert config[name] == nested[group][field] == value
         assert is_of_declared_type(find_spec(name), value)
     assert pickle.loads(pickle.dumps(config)) == copy.deepcopy(config) == config
     assert hash(config) == hash(config.replace())

@@ -46,6 +46,7 @@ def locked_scheduler():
     with (
         dask.config.set({
             'distributed.nanny.pre-spawn-environ': {},  # of this process, too
+            'distributed.worker.multiprocessing-method': 'forkserver',  # which imports Dask once
             'distributed.scheduler.allowed-failures': 1,
         }),
         distributed.LocalCluster(
@@ -173,7 +174,8 @@ def test_results_are_those_of_one_process_also_if_a_worker_dies(scheduler, tmp_p
 
 
 def test_workers_speak_tls_and_are_seen_on_this_machine_only():
-    with cluster.open_runner(1, None, cluster._NO_BAR) as runner:
+    spawning = dask.config.set({'distributed.worker.multiprocessing-method': 'spawn'})
+    with spawning, cluster.open_runner(1, None, cluster._NO_BAR) as runner:
         assert runner.run(_last_first, range(1, 3)) == [1, 2]
         family = [psutil.Process(), *psutil.Process().children()]
         sockets = [socket for process in family for socket in process.net_connections()]
@@ -292,5 +294,7 @@ def test_one_process_needs_no_dask(root, tmp_path):
         'import sys; from gp_ground_seg.cli.main import main; main(sys.argv[1:]); '
         'assert not {"dask", "distributed"} & set(sys.modules)'
     )
-    command = [sys.executable, '-c', code, 'segment', root, '-o', tmp_path / 'out']
+    scan = root / 'sequences/00/velodyne/000000.bin'
+    words = 'segment', scan, '-o', tmp_path / 'out', '--set', 'runtime.backend=numpy'
+    command = [sys.executable, '-c', code, *words]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

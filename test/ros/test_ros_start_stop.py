@@ -88,31 +88,50 @@ def test_words_that_nobody_takes_are_refused(capsys, words):
     assert 'nonsense' in capsys.readouterr().err
 
 
-def failure(*words, **environment):
-    """The one line with which a Python process ends with code 2."""
-    command = [sys.executable, *words]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, **environment)
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    return line
+def errors_of(code, *words):
+    """The lines on standard error of a Python process that runs a code and says nothing else."""
+    command = [sys.executable, '-c', code, *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (0, ''), done.stderr
+    return done.stderr.splitlines()
 
 
-@pytest.mark.parametrize('given', [{}, {'HOME': '/proc'}, {'ROS_LOG_DIR': '/proc'}])
-def test_logs_that_have_no_folder(given):
-    of_logs = 'HOME', 'ROS_HOME', 'ROS_LOG_DIR'
-    others = {name: value for name, value in os.environ.items() if name not in of_logs}
-    line = failure(*MODULE, env={**others, **given})
-    assert line.endswith(': set ROS_LOG_DIR to a folder that the node may write to')
+NO_FOLDER = """
+import os
+import gp_ground_seg.ros.node  # once for all
+from gp_ground_seg.cli.main import main
+for name in ('HOME', 'ROS_HOME', 'ROS_LOG_DIR'):
+    os.environ.pop(name, None)
+for given in ({}, {'HOME': '/proc'}, {'ROS_LOG_DIR': '/proc'}):
+    if not (process := os.fork()):
+        os.environ |= given
+        os._exit(main(['node']))
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 2
+"""
 
 
-@pytest.mark.parametrize('command', ['the node', 'play', 'demo'])
-def test_missing_ros_is_said_in_one_line(tmp_path, command):
+def test_logs_that_have_no_folder():
+    lines = errors_of(NO_FOLDER)
+    assert len(lines) == 3
+    for line in lines:
+        assert line.endswith(': set ROS_LOG_DIR to a folder that the node may write to')
+
+
+NO_ROS = """
+import sys
+sys.modules['rclpy'] = None
+from gp_ground_seg.cli.main import main
+for words in (['node'], ['play', sys.argv[1]], ['demo']):
+    assert main(words) == 2
+"""
+
+
+def test_missing_ros_is_said_in_one_line(tmp_path):
     write_ros2_bag(tmp_path / 'drive.mcap', 1)
-    words = [command.split()[-1], *[str(tmp_path / 'drive.mcap')] * (command == 'play')]
-    run = f'from gp_ground_seg.cli.main import main; sys.exit(main({words}))'
-    line = failure('-c', f"import sys; sys.modules['rclpy'] = None; {run}")
-    assert f'{command} needs ROS 2, which cannot be imported' in line
-    assert f'pip install {ROS_WHEELS}' in line
+    lines = errors_of(NO_ROS, tmp_path / 'drive.mcap')
+    for command, line in zip(('the node', 'play', 'the demo'), lines, strict=True):
+        assert f'{command} needs ROS 2, which cannot be imported' in line
+        assert f'pip install {ROS_WHEELS}' in line
 
 
 NAME = f'{NAMESPACE}/front/filter'
