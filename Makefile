@@ -48,10 +48,10 @@ $(VENV)/.docs: setup.py $(VENV)/.dev
 demo: $(VENV)/.ros
 	$(BIN)/gp-ground-seg demo --force
 
-# A test that hangs fails after so many seconds, with a traceback. Two processes share the modules:
-# one compiles at the first run, and the other goes on with tests that need no compiled code.
+# A test that hangs fails after so many seconds, with a traceback. Two processes share the modules,
+# in the order of test/conftest.py: one compiles, the other begins with what needs no compiled code.
 test: $(VENV)/.dev
-	$(WITH_KITTI) $(BIN)/python -m pytest -n 2 --dist loadfile --timeout=300 -m 'not slow'
+	$(WITH_KITTI) $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --timeout=300 -m 'not slow'
 
 # The slow ones run one after the other: some measure time and memory.
 test-all: test

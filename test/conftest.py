@@ -28,6 +28,18 @@ def pytest_configure(config):
     config.addinivalue_line('filterwarnings', 'error')
 
 
+# `make test` has two processes: one compiles first, and the other has work until that is done.
+# What takes long is not last.
+FIRST = 'frozen simulator_scan sensor_pose likelihood write_faults wrong_data jit config'
+FIRST += ' simulator_terrain cli_main layout cli_bags kernels config_files point_cloud2 formats'
+FIRST += ' files scale segmenter ros_start_stop step_edges pages ros_process ros_managed cli_demo'
+
+
+def pytest_collection_modifyitems(items):
+    order = {f'test_{name}': k for k, name in enumerate(FIRST.split())}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
+
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 ROAD, OTHER_OBJECT = 40, 99  # classes of SemanticKITTI
 

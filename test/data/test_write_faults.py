@@ -23,8 +23,6 @@ from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data import files
 from gp_ground_seg.data.bags import BagReader, BagWriter
 
-pytestmark = pytest.mark.usefixtures('compiled_code')
-
 # What is written counts, not what is computed.
 QUICK = ('runtime.backend=numpy', 'learning.mode=fixed', 'grid.n_segments=36', 'grid.n_bins=30')
 MINE = b'by hand'
