@@ -71,7 +71,7 @@ class HeightRule:
         self.height = height
         self.journal = [] if journal is None else journal
 
-    def reset(self) -> None:
+    def reset(self, scan) -> None:
         self.journal.append(f'R{self.name}')
 
     def run(self, points: np.ndarray) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -89,7 +88,8 @@ def load_scan(item: Frame | SimulatedFrame) -> KnownScan:
     if isinstance(item, Frame):
         return load_kitti(item)
     scene, rng = SCENES[item.scene](item.seed), np.random.default_rng(item.seed)
-    made = simulate_scan(scene, SENSORS[item.sensor], rng, x=item.x)
+    sensor = SENSORS[item.sensor]
+    made = simulate_scan(scene, sensor, rng, x=item.x)
     truth = np.where(made.is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     heights = object_heights(scene.terrain, scene.solids)[made.object_id]
     class_of = _class_of(made.kind, made.object_id, heights)
@@ -98,6 +98,7 @@ def load_scan(item: Frame | SimulatedFrame) -> KnownScan:
         ground_z=made.ground_z, is_ground=made.is_ground,
         objects=Objects(class_of, made.object_id, made.ground_z),
         std='ground_std', cluster=f'{item.scene} {item.seed}',
+        mount=(sensor.height, sensor.origin or (0.0, 0.0, 0.0)),
     )  # fmt: skip
 
 
@@ -324,13 +325,8 @@ def score_scenes(
     parameters and the true height and place of the sensor. All sensors have one set of
     parameters. Low things, and rough and steep ground, have tables of their own.
     """
-    parts = []
-    for sensor, group in itertools.groupby(frames, attrgetter('sensor')):
-        model = SENSORS[sensor]
-        peer = PatchworkppMethod(model.height, model.origin or (0.0, 0.0, 0.0))
-        methods: list[Method] = [OurMethod(config), peer]
-        parts.append(score_methods([*group], methods, load_scan, each_alone=True, runner=runner))
-    scores = Scores.joined(parts)
+    methods: list[Method] = [OurMethod(config), PatchworkppMethod()]
+    scores = score_methods(frames, methods, load_scan, each_alone=True, runner=runner)
     tables = {'scenes': _scene_table(scores)}
     for name, make, scenes in (('low', _low_table, LOW), ('rough', _rough_table, ROUGH)):
         if own := [pair for pair in scores.sequences if pair.split()[1] in scenes]:

@@ -106,7 +106,7 @@ class Learner(HeightRule):
 
     depends_on_past = True
 
-    def reset(self):
+    def reset(self, scan):
         self.height = -1.75
 
     def run(self, points):

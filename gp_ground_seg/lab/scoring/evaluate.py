@@ -40,6 +40,8 @@ POSE = ('height', 'height_estimated', 'roll', 'pitch')
 STAGE = 'stage_'
 """Beginning of the columns with the seconds of a stage of ours."""
 Points = npt.NDArray[np.floating]
+Mount = tuple[float | None, Sequence[float]]
+"""Height of a sensor over the ground, if known, and its place in the frame of the cloud [m]."""
 
 ALL = 'all'
 KEYS = ('method', 'sequence', 'index')
@@ -72,8 +74,8 @@ class Method(Protocol):
     name: str
     depends_on_past: bool  # whether the labels of a scan depend on the scans before it
 
-    def reset(self) -> None:
-        """Forget what was learned from earlier scans."""
+    def reset(self, scan: KnownScan) -> None:
+        """Forget what was learned from earlier scans; `scan` is the next."""
 
     def run(self, points: Points) -> None:
         """Segment a scan of (N, 4) x, y, z, intensity: the part that is timed."""
@@ -94,7 +96,7 @@ class OurMethod:
         """Send the configuration to a worker."""
         return type(self), (self._segmenter.config, self.name)
 
-    def reset(self) -> None:
+    def reset(self, scan: KnownScan) -> None:
         """Do nothing: each scan is segmented by itself."""
 
     def run(self, points: Points) -> None:
@@ -122,6 +124,7 @@ class KnownScan:
     """Field of `Segmentation` that the errors of the height are compared with: heights of ground
     returns scatter by `return_std`, exact heights by `ground_std`."""
     cluster: str = ''  # scans that the bootstrap draws together; by default the sequence
+    mount: Mount | None = None  # that a method with a past is told, if it differs by scan
     cut: CutScan | None = None  # what of it is segmented once more, to count low things
 
 
@@ -196,7 +199,7 @@ def score_rows(
         seconds = {}
         for method in methods if k % 2 == 0 else reversed(methods):
             if forgets:
-                method.reset()
+                method.reset(scan)
             start = time.perf_counter()
             _run(method, scan)
             seconds[method] = time.perf_counter() - start
@@ -226,7 +229,7 @@ def _low_things(scan: KnownScan, method: Method, *, forgets: bool) -> dict[str, 
     if scan.cut is None:
         return {}
     if forgets:
-        method.reset()
+        method.reset(scan)
     _run(method, replace(scan, points=scan.points[scan.cut.is_kept]))
     return scan.cut.count_ground(method.result().label)
 
@@ -296,14 +299,6 @@ class Scores(NamedTuple):
         """Return the part of some sequences."""
         names = [*sequences]
         return Scores(*(frame[frame['sequence'].isin(names)] for frame in self))
-
-    @classmethod
-    def joined(cls, parts: Iterable[Scores]) -> Scores:
-        """Join the scores of the same methods on several groups of scans."""
-        concat = partial(require_pandas().concat, ignore_index=True)
-        groups = [*zip(*parts, strict=True)]
-        # pandas warns of frames without a row.
-        return cls(*(concat([f for f in own if len(f)] or own[:1]) for own in groups))
 
 
 def make_scores(parts: Iterable[Rows]) -> Scores:

@@ -16,7 +16,14 @@ from gp_ground_seg.core.errors import ConfigError, require
 from gp_ground_seg.core.frame import FloatArray, Frame, Label
 from gp_ground_seg.core.parameters.config import Config, SensorConfig
 from gp_ground_seg.core.parameters.schema import AUTO
-from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, MethodResult, OurMethod, Points
+from gp_ground_seg.lab.scoring.evaluate import (
+    PATCHWORKPP,
+    KnownScan,
+    MethodResult,
+    Mount,
+    OurMethod,
+    Points,
+)
 
 
 class PatchworkppMethod:
@@ -33,7 +40,7 @@ class PatchworkppMethod:
         self, sensor_height: float | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> None:
         self._module = require('pypatchworkpp', 'pypatchworkpp')
-        self._sensor_height, self._origin = sensor_height, np.array(origin)
+        self._mount: Mount = sensor_height, origin
         self.reset()
 
     @classmethod
@@ -52,14 +59,16 @@ class PatchworkppMethod:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Send a worker what to make it of."""
-        return type(self), (self._sensor_height, self._origin)
+        return type(self), self._mount
 
-    def reset(self) -> None:
-        """Start anew with its default thresholds."""
+    def reset(self, scan: KnownScan | None = None) -> None:
+        """Start anew with its default thresholds, and the mount of the scan if that is known."""
+        sensor_height, origin = (scan and scan.mount) or self._mount
+        self._origin = np.array(origin)
         with _c_stdout_silenced():  # it greets on standard output, which is for tables
             parameters = self._module.Parameters()
-            if self._sensor_height is not None:
-                parameters.sensor_height = self._sensor_height
+            if sensor_height is not None:
+                parameters.sensor_height = sensor_height
             self._uprightness = float(parameters.uprightness_thr)
             self._estimator = self._module.patchworkpp(parameters)
 
