@@ -29,68 +29,58 @@ def double(x):
 def half(x):
     return 0.5 * x
 """
-PROCESSES = """
-import json, logging, os, resource, signal, sys, traceback
+RUN = """
+import json, logging, os, resource, signal, sys
 import numba
 from gp_ground_seg.core import jit
 numba.njit(lambda x: x)(1.0)  # what the first compilation imports and fills is shared too
-code = sys.argv[1]
 for line in sys.stdin:
+    n, folder, limit, environment = json.loads(line)
     started = []
-    for k, (folder, environment, limit) in enumerate(json.loads(line)):
-        if process := os.fork():
-            started.append(process)
-            continue
-        try:
-            for number, name in ((1, 'out'), (2, 'err')):
-                file = open(f'{folder}-{k}.{name}', 'w')
-                os.dup2(file.fileno(), number)
-            os.chdir(folder)
-            os.environ.update(environment)
-            sys.dont_write_bytecode = limit is not None
-            resource.setrlimit(resource.RLIMIT_FSIZE, 2 * [limit or resource.RLIM_INFINITY])
-            exec(code)
-            sys.stdout.flush()
-            os._exit(0)
-        except BaseException:
-            traceback.print_exc()
-            os._exit(1)
-    ends = [os.waitpid(process, 0)[1] for process in started]
-    print(json.dumps([os.waitstatus_to_exitcode(end) for end in ends]), flush=True)
+    while len(started) < n and (process := os.fork()):
+        started.append(process)
+    if len(started) == n:
+        ends = [os.waitpid(process, 0)[1] for process in started]
+        print(json.dumps([os.waitstatus_to_exitcode(end) for end in ends]), flush=True)
+        continue
+    for number, name in ((1, 'out'), (2, 'err')):
+        file = open(f'{folder}-{len(started)}.{name}', 'w')
+        os.dup2(file.fileno(), number)
+    os.chdir(folder)
+    os.environ.update(environment)
+    sys.dont_write_bytecode = limit is not None
+    resource.setrlimit(resource.RLIMIT_FSIZE, 2 * [limit or resource.RLIM_INFINITY])
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format='%(message)s')
+    import small
+    jit._patience = float(os.environ.get('PATIENCE', '60'))
+    was_kept = small.is_code_kept()
+    assert small.has_to_compile() == (jit.JIT_ENABLED and not was_kept)
+    result, used = small.double(21.0), [small.double]
+    if 'KILL' in os.environ:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if 'PART' not in os.environ:
+        small.half(1.0)
+        used.append(small.half)
+    stats = [one.stats for one in used if jit.JIT_ENABLED]
+    hits, misses = (sum(sum(one[k].values()) for one in stats) for k in (1, 2))
+    place = small.code_folder()
+    print(json.dumps([result, hits, misses, was_kept, place and str(place)]), flush=True)
+    os._exit(0)
 """
-"""Forks a process for each of the folders, environments and limits of a line, so that numba is
-imported once, and prints their exit codes."""
-RUN = """
-logging.basicConfig(level=logging.INFO, stream=sys.stderr, format='%(message)s')
-import small
-jit._patience = float(os.environ.get('PATIENCE', '60'))
-was_kept = small.is_code_kept()
-assert small.has_to_compile() == (jit.JIT_ENABLED and not was_kept)
-result, used = small.double(21.0), [small.double]
-if 'KILL' in os.environ:
-    os.kill(os.getpid(), signal.SIGKILL)
-if 'PART' not in os.environ:
-    small.half(1.0)
-    used.append(small.half)
-stats = [one.stats for one in used if jit.JIT_ENABLED]
-hits, misses = (sum(sum(one[k].values()) for one in stats) for k in (1, 2))
-folder = small.code_folder()
-print(json.dumps([result, hits, misses, was_kept, str(folder) if folder else None]))
-"""
+"""Forks processes that run the module at the same time, so that numba is imported once: a line
+says how many, where, what their files may hold and variables; they end before their codes are
+printed."""
 
 
 @pytest.fixture(scope='module')
 def processes():
-    """Runs processes at the same time; returns the exit code of each."""
+    """Runs as many processes as the first argument says; returns the exit code of each."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith(('NUMBA_', 'XDG_'))}
-    with subprocess.Popen(
-        [sys.executable, '-c', PROCESSES, RUN],
-        env=kept, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    ) as server:  # fmt: skip
+    pipes = {'stdin': subprocess.PIPE, 'stdout': subprocess.PIPE, 'text': True}
+    with subprocess.Popen([sys.executable, '-c', RUN], env=kept, **pipes) as server:
 
-        def run(requests):
-            server.stdin.write(f'{json.dumps(requests)}\n')
-            server.stdin.flush()
+        def run(*request):
+            print(json.dumps(request), file=server.stdin, flush=True)
             return json.loads(server.stdout.readline())
 
         yield run
@@ -106,20 +96,19 @@ class Program:
 
     def run(self, limit=None, **environment: str) -> list:
         """What a run says; it writes at most `limit` bytes to a file, as to a full disk."""
-        (said,) = self.run_some(1, limit, **environment)
-        return json.loads(said)
+        return self.run_some(1, limit, **environment)[0]
 
-    def run_some(self, n, limit=None, code=0, **environment: str) -> list[str]:
-        """What each of several runs at the same time prints; they end with that code."""
-        changed = {'NUMBA_CACHE_DIR': str(self.cache), **environment}
-        codes = self._processes(n * [(str(self.folder), changed, limit)])
-        texts = {
-            kind: [Path(f'{self.folder}-{k}.{kind}').read_text() for k in range(n)]
-            for kind in ('out', 'err')
-        }
-        self.stderr = ''.join(texts['err'])
+    def run_some(self, n, limit=None, code=0, **environment: str) -> list[list]:
+        """What each of several runs at the same time says; they end with that code."""
+        environment = {'NUMBA_CACHE_DIR': str(self.cache), **environment}
+        codes = self._processes(n, str(self.folder), limit, environment)
+        said, errors = (
+            [Path(f'{self.folder}-{k}.{name}').read_text() for k in range(n)]
+            for name in ('out', 'err')
+        )
+        self.stderr = ''.join(errors)
         assert codes == n * [code], self.stderr
-        return texts['out']
+        return [json.loads(text) for text in said if code == 0]
 
     def code(self, name: str = 'double', kind: str = 'nbc') -> Path:
         (found,) = self.cache.rglob(f'small.{name}-*.{kind}')
@@ -207,7 +196,7 @@ def test_a_full_disk_ends_nothing(program):
 
 
 def test_one_process_compiles_and_others_wait_for_its_files(program):
-    found = [json.loads(said) for said in program.run_some(3)]
+    found = program.run_some(3)
     assert {result for result, *_ in found} == {42.0}
     assert sum(misses for _, _, misses, *_ in found) == 2
     assert sum(hits for _, hits, *_ in found) == 4
