@@ -199,9 +199,9 @@ def count(number: int, noun: str) -> str:
     return f'{in_thousands(number)} {noun}{"" if number == 1 else "s"}'
 
 
-def progress(title: str, *, quiet: bool = False, unit: str = 'frame') -> partial[tqdm[Any]]:
+def progress(title: str, *, quiet: bool = False) -> partial[tqdm[Any]]:
     """Progress of items, or of a `total`, on standard error; in a file every half minute."""
-    own = {'desc': title, 'unit': unit, 'file': sys.stderr, 'disable': quiet, 'leave': False}
+    own = {'desc': title, 'unit': 'frame', 'file': sys.stderr, 'disable': quiet, 'leave': False}
     if not sys.stderr.isatty():
         own |= dict.fromkeys(('mininterval', 'maxinterval', 'delay'), LINE_PERIOD)
     return partial(tqdm, **own)

@@ -32,7 +32,7 @@ from gp_ground_seg.lab.scoring.evaluate import (
 )
 from gp_ground_seg.lab.scoring.metrics import ratio
 from gp_ground_seg.lab.scoring.objects import CLASSES, LOW_CLASSES, LOW_HEIGHTS, Objects
-from gp_ground_seg.lab.scoring.peers import InterpolationMethod, PatchworkppMethod
+from gp_ground_seg.lab.scoring.peers import INTERPOLATION, InterpolationMethod, PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import COUNT, SIGNED, Form, Report, Table, frame_of
 from gp_ground_seg.lab.scoring.tables import (
     MEASURES,
@@ -128,13 +128,14 @@ MODELS['Z-L, all learned'] = ALL_LEARNED
 the last one learns all length-scales too, as the paper does."""
 PAIRS = [
     *(
-        (f'{ours}, {how}', f'{other}, {how}')
+        (f'{ours} - {other}', how, f'{ours}, {how}', f'{other}, {how}')
         for other, ours in itertools.combinations(('constant', 'Z', 'Z-L'), 2)
         for how in ('not learned', 'learned')
     ),
-    ('Z-L, all learned', 'Z-L, learned'),
+    ('Z-L - Z-L', 'all learned - learned', 'Z-L, all learned', 'Z-L, learned'),
+    ('Z-L - interpolation', 'learned', 'Z-L, learned', INTERPOLATION),
 ]
-"""Models of which the differences are shown."""
+"""Differences that are shown: their titles, what is learned, and the names of the two models."""
 
 STEPS = {
     'vertical faces': ('faces.',),
@@ -199,12 +200,11 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     """
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     scores, models = score_variants(items, variants, [InterpolationMethod(config)], runner)
-    learned, lines = 'Z-L, learned', scores.methods[-1]
-    pairs = [pair for pair in [*PAIRS, (learned, lines)] if {*pair} <= {*scores.methods}]
-    how = [[name.partition(', ')[2] for name in pair if name in MODELS] for pair in pairs]
+    known = [row for row in PAIRS if {*row[2:]} <= {*scores.methods}]
+    pairs = [(ours, other) for _, _, ours, other in known]
     rows = frame_of({
-        'pair': [' - '.join(name.partition(',')[0] for name in pair) for pair in pairs],
-        'theta': [' - '.join(dict.fromkeys(words)) for words in how],
+        'pair': [title for title, *_ in known],
+        'theta': [how for _, how, *_ in known],
         **_differences(scores, 'iou', pairs, 'iou_'),
         **_differences(scores, 'rmse', pairs, 'rmse_'),
     })  # fmt: skip

@@ -37,7 +37,7 @@ def config_of(**changes):
 def surface_by_the_loops(seed):
     """Arguments of a surface and what the loops make of them, for each backend in turn."""
     rng = np.random.default_rng(seed)
-    xyz = hilly_scan(int(rng.choice([30, 900, 900])) * (seed > 0), seed)
+    xyz = hilly_scan(int(rng.choice([30, 600, 600])) * (seed > 0), seed)
     has_sill = seed % 2 == 1
     if has_sill:  # 0.4 m high: it hides what is behind it, and is low enough for a seed
         r = np.hypot(xyz[:, 0], xyz[:, 1])

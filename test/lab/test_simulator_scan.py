@@ -172,7 +172,7 @@ def test_objects_have_one_kind_one_place_and_room(scene):
 
 def test_a_tilted_sensor_on_a_drive_sees_the_same_world(scene):
     """Points and feet are on the terrain; a scan depends on place, scene and seed only."""
-    tilted = replace(EXACT, n_columns=60, roll=-0.1, pitch=0.12)
+    tilted = replace(EXACT, n_columns=24, roll=-0.1, pitch=0.12)
 
     def scan_at(seed, scene=scene):
         return simulate_scan(scene, tilted, np.random.default_rng(seed), x=1.5)
@@ -187,10 +187,9 @@ def test_a_tilted_sensor_on_a_drive_sees_the_same_world(scene):
     for local, tolerance in ((returns[made.is_ground], 5e-5), (feet, 1e-6)):
         x, y, z = (local @ made.rotation.T + made.position).T
         np.testing.assert_allclose(z, scene.terrain.height(x, y), atol=tolerance)
-    same, another = (SCENES[scene.name](seed) for seed in (7, 8))
-    assert np.array_equal(made.points, scan_at(5, same).points)
+    assert np.array_equal(made.points, scan_at(5, SCENES[scene.name](7)).points)
     assert not np.array_equal(made.points, scan_at(6).points)
-    assert not np.array_equal(made.points, scan_at(5, another).points)
+    assert not np.array_equal(made.points, scan_at(5, scene_of(scene.name)).points)
 
 
 # Hidden, mirrored, and seen from a slope.
