@@ -32,7 +32,8 @@ def pytest_configure(config):
 # What takes long is not last.
 FIRST = 'frozen simulator_scan sensor_pose likelihood write_faults wrong_data jit config'
 FIRST += ' simulator_terrain cli_main layout cli_bags kernels config_files point_cloud2 formats'
-FIRST += ' files scale segmenter ros_start_stop step_edges pages ros_process ros_managed cli_demo'
+FIRST += ' files scale segmenter ros_start_stop step_edges pages ros_process ros_managed'
+FIRST += ' ros_node cli_demo'
 
 
 def pytest_collection_modifyitems(items):

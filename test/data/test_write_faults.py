@@ -11,6 +11,7 @@ import json
 import os
 import re
 import resource
+from functools import cache
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from bag_samples import scan, write_ros2_bag
 from cli_runner import run
 from evaluation_samples import write_streets
 
+from gp_ground_seg import Config
 from gp_ground_seg.cli import tune
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data import files
@@ -137,6 +139,8 @@ def at_inputs(inputs, monkeypatch):
     monkeypatch.chdir(inputs)
     monkeypatch.setattr(tune, 'open_server', lambda _port: contextlib.nullcontext((None, '')))
     monkeypatch.setattr(tune, 'Tuner', Page)
+    # The same text each time, which takes longer than all else.
+    monkeypatch.setattr(Config, 'to_yaml', cache(Config.to_yaml))
 
 
 @pytest.mark.usefixtures('at_inputs')
