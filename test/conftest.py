@@ -12,8 +12,6 @@ from hypothesis import settings
 
 from gp_ground_seg.core.backend import Backend, NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
-from gp_ground_seg.core.compiled.likelihood import log_likelihood as compiled
-from gp_ground_seg.core.gp.likelihood import log_likelihood
 from gp_ground_seg.core.jit import JIT_ENABLED
 from gp_ground_seg.core.segmenter import warm_up
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
@@ -124,18 +122,6 @@ def backend(request: pytest.FixtureRequest) -> Backend:
     if request.param is NumbaBackend:
         request.getfixturevalue('compiled_code')
     return request.param()
-
-
-def compiled_log_likelihood(theta, inliers, slope_std, latent_terms):
-    """The compiled twin of `log_likelihood`, called as that is."""
-    gradient = np.empty(len(theta))
-    return compiled(theta, inliers, slope_std, latent_terms, gradient), gradient
-
-
-@pytest.fixture(params=[log_likelihood, compiled_log_likelihood], ids=['numpy', 'numba'])
-def likelihood(request):
-    """Each form of the log marginal likelihood in turn."""
-    return request.param
 
 
 @pytest.fixture(scope='session')

@@ -73,26 +73,20 @@ printed."""
 
 
 @pytest.fixture(scope='module')
-def processes():
-    """Runs as many processes as the first argument says; returns the exit code of each."""
+def server():
     kept = {k: v for k, v in os.environ.items() if not k.startswith(('NUMBA_', 'XDG_'))}
     pipes = {'stdin': subprocess.PIPE, 'stdout': subprocess.PIPE, 'text': True}
-    with subprocess.Popen([sys.executable, '-c', RUN], env=kept, **pipes) as server:
-
-        def run(*request):
-            print(json.dumps(request), file=server.stdin, flush=True)
-            return json.loads(server.stdout.readline())
-
-        yield run
+    with subprocess.Popen([sys.executable, '-c', RUN], env=kept, **pipes) as process:
+        yield process
 
 
 class Program:
     """A module with two compiled functions, run in processes of their own."""
 
-    def __init__(self, folder: Path, processes):
+    def __init__(self, folder: Path, server):
         self.folder, self.cache = folder, folder / 'cache'
         (folder / 'small.py').write_text(MODULE)
-        self._processes, self.stderr = processes, ''
+        self._server, self.stderr = server, ''
 
     def run(self, limit=None, **environment: str) -> list:
         """What a run says; it writes at most `limit` bytes to a file, as to a full disk."""
@@ -100,8 +94,9 @@ class Program:
 
     def run_some(self, n, limit=None, code=0, **environment: str) -> list[list]:
         """What each of several runs at the same time says; they end with that code."""
-        environment = {'NUMBA_CACHE_DIR': str(self.cache), **environment}
-        codes = self._processes(n, str(self.folder), limit, environment)
+        request = n, str(self.folder), limit, {'NUMBA_CACHE_DIR': str(self.cache), **environment}
+        print(json.dumps(request), file=self._server.stdin, flush=True)
+        codes = json.loads(self._server.stdout.readline())
         said, errors = (
             [Path(f'{self.folder}-{k}.{name}').read_text() for k in range(n)]
             for name in ('out', 'err')
@@ -120,10 +115,10 @@ NOT_KEPT = [42.0, 0, 2, False, None]
 
 
 @pytest.fixture
-def program(tmp_path, processes):
+def program(tmp_path, server):
     folder = tmp_path / 'program'
     folder.mkdir(0o755)
-    return Program(folder, processes)
+    return Program(folder, server)
 
 
 def test_code_is_compiled_once_said_once_and_then_loaded(program):

@@ -7,12 +7,24 @@ import numpy as np
 import pytest
 import reference_gp
 
+from gp_ground_seg.core.compiled import likelihood as compiled
 from gp_ground_seg.core.frame import Inliers
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
+from gp_ground_seg.core.gp.likelihood import log_likelihood
 
 # With a factor for each class of lines.
 FACTORS = np.array([0.8, 0.5, 1.3, 1.0, 0.7, 2.0, 0.9, 1.1, 0.6])
 TYPICAL = np.log([0.3, 0.05, 0.9, 3.0, 0.25, *FACTORS])
+
+
+def compiled_log_likelihood(theta, *arguments):
+    gradient = np.empty(len(theta))
+    return compiled.log_likelihood(theta, *arguments, gradient), gradient
+
+
+@pytest.fixture(params=[log_likelihood, compiled_log_likelihood], ids=['numpy', 'numba'])
+def likelihood(request):
+    return request.param
 
 
 def scaled(*factors):
