@@ -310,9 +310,8 @@ class GroundSegmenter:
             below = look(below.levelled) or below
         if not is_doubtful(below):
             return below
-        first = [view for view in map(look, OTHER_AXES) if view is not None]
-        again = (look(view.levelled) for view in first)
-        return clearest(below, [view for view in again if view is not None])
+        first = map(look, OTHER_AXES)
+        return clearest(below, [look(view.levelled) if view else None for view in first])
 
 
 def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[float, ...]:
