@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray
+from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray
 from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import (
@@ -21,24 +23,17 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     LowestPoints,
     Moments,
     Plane,
+    cells_of,
     crossed_at,
     described,
     distance,
     fit_cells,
     levelness,
     refutation_by,
-    segment_directions,
     support_by,
     tolerance_at,
     tukey_weight,
-    weight_at,
 )
-
-# Ring at the start of each stretch of range, a little early because of rounding: a range in the
-# stretch lies in that ring or the next, as the narrowest ring is four stretches wide.
-_PER_METRE = 4.0 / float(RING_EDGES[1] - RING_EDGES[0])
-_STARTS = RING_EDGES[0] + (np.arange(int(RING_EDGES[-1] * _PER_METRE) + 1) - 0.02) / _PER_METRE
-_RING_TABLE = np.clip(np.searchsorted(RING_EDGES, _STARTS, side='right') - 1, 0, N_RINGS - 1)
 
 
 @jit(entry=True)
@@ -48,19 +43,25 @@ def _fit_cells(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
 
 def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     """Do what `gp_ground_seg.core.pipeline.ground_plane.fit_plane` does, to rounding."""
-    directions = segment_directions(len(candidates.offsets) - 1)
-    x, y, z, r, tolerance, inverse, weight, lowest_z = np.empty((8, N_CELLS))
-    number = np.empty(N_CELLS, dtype=np.int64)
-    is_alone = np.empty(N_CELLS, dtype=np.bool_)
-    cells = LowestPoints(x, y, z, r, tolerance, inverse, weight, number, lowest_z, is_alone)
-    n = _tabulate(candidates, directions, cells)
-    cells = LowestPoints._make(column[:n] for column in cells)
+    r, z, lowest_z = np.empty((3, N_CELLS))
+    number, segment = np.empty((2, N_CELLS), dtype=np.int64)
+    columns: tuple[Any, ...] = r, z, lowest_z, number, np.empty(N_CELLS, np.bool_), segment
+    n = _tabulate(candidates, *columns)
+    cells = cells_of(candidates.n_segments, *(column[:n] for column in columns))
     return described(cells, *_fit_cells(cells, max_slope)) if n >= MIN_CELLS else None
 
 
 @jit(entry=True)
-def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoints) -> int:
-    """Set the lowest points; return their number."""
+def _tabulate(
+    candidates: Candidates,
+    low_r: FloatArray,
+    low_z: FloatArray,
+    lowest_z: FloatArray,
+    number: IntArray,
+    is_alone: BoolArray,
+    segment: IntArray,
+) -> int:
+    """Set the columns that `cells_of` takes; return the number of cells."""
     offsets, r, z = candidates.offsets, candidates.r, candidates.z
     n_segments = len(offsets) - 1
     cell_of, starts = np.empty(len(r), np.int64), np.zeros(N_CELLS + 1, np.int64)
@@ -69,8 +70,7 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
         for c in range(offsets[m], offsets[m + 1]):
             cell_of[c] = -1
             if RING_EDGES[0] <= r[c] < RING_EDGES[N_RINGS] and abs(z[c]) < MAX_Z:
-                ring = _RING_TABLE[int((r[c] - RING_EDGES[0]) * _PER_METRE)]
-                cell_of[c] = first + ring + (1 if r[c] >= RING_EDGES[ring + 1] else 0)
+                cell_of[c] = first + np.searchsorted(RING_EDGES, r[c], side='right') - 1
                 starts[cell_of[c] + 1] += 1
     for cell in range(N_CELLS):
         starts[cell + 1] += starts[cell]
@@ -89,13 +89,8 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
             first, end = starts[cell], ends[cell]
             _sort(near_r, near_z, home, first, end)
             k = _lowest_together(near_r, near_z, first, end)
-            cells.is_alone[n], k = k < 0, max(k, first)
-            cells.lowest_z[n] = near_z[first]
-            range_, m = near_r[k], home[k]
-            cells.x[n], cells.y[n] = range_ * directions[0, m], range_ * directions[1, m]
-            cells.z[n], cells.r[n] = near_z[k], range_
-            cells.tolerance[n], cells.weight[n] = tolerance_at(range_), weight_at(range_)
-            cells.inverse[n], cells.cell[n] = 1.0 / cells.tolerance[n], cell
+            is_alone[n], k, lowest_z[n], number[n] = k < 0, max(k, first), near_z[first], cell
+            low_r[n], low_z[n], segment[n] = near_r[k], near_z[k], home[k]
             n += 1
     return n
 

@@ -11,7 +11,6 @@ import numpy as np
 from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray, Values
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import SENSOR_HEIGHTS
-from gp_ground_seg.core.pipeline.points import Direction
 
 N_SECTORS = 36
 NEAREST, FARTHEST = 0.5, 40.0
@@ -32,7 +31,6 @@ MAX_Z = 65.0
 N_RINGS = math.ceil(math.log(FARTHEST / NEAREST) / math.log(RING_RATIO))
 RING_EDGES = NEAREST * RING_RATIO ** np.arange(N_RINGS + 1.0)
 N_CELLS = N_SECTORS * N_RINGS
-_NONE = -1
 
 NEAR, ENOUGH_NEAR = 8.0, 12
 """Range [m] and least number of the points that the height is measured at: kerbs and verges
@@ -71,6 +69,10 @@ from which the tilt explains nothing: shelves on one side and floor on the other
 Plane = tuple[float, float, float]
 """Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
 
+MIN_DEPRESSION = 0.105
+"""Angle to the plane of the ground at which a sensor sees the nearest of it, at least [rad]. From
+the origin of a vehicle, at its axles, a sensor on the roof seems to see it at less."""
+
 N_TRIPLES = 192
 """Planes tried through three cells each."""
 N_LEVEL = 64
@@ -93,7 +95,7 @@ class LowestPoints(NamedTuple):
     r: FloatArray  # (C,) horizontal range [m]
     tolerance: FloatArray  # (C,) distance to the plane that the point still supports [m]
     inverse: FloatArray  # (C,) one over the tolerance [1/m]
-    weight: FloatArray  # (C,) see `weight_at`
+    weight: FloatArray  # (C,) the largest, one, at `MIDDLE`
     cell: IntArray  # (C,) number of the cell: sector times `N_RINGS`, plus ring
     # (C,) height of the lowest of all [m], which may lie alone: floor at the foot of a wall
     lowest_z: FloatArray
@@ -114,19 +116,43 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
 
     It is the lowest that has `N_TOGETHER` - 1 more within its tolerance above it; where there is
     none, the lowest. Of equally low ones the nearest comes first, then that of the first segment,
-    so that the order of the points does not matter. A point's azimuth is taken to be that of the
-    middle of its segment.
+    so that the order of the points does not matter.
     """
-    alone, together = _lowest(candidates.offsets, candidates.r, candidates.z)
-    cell = np.flatnonzero(alone != _NONE)
-    is_alone = together[cell] == _NONE
-    index = np.where(is_alone, alone[cell], together[cell])
-    segment = np.searchsorted(candidates.offsets, index, side='right') - 1
-    cosine, sine = segment_directions(len(candidates.offsets) - 1)
-    r = candidates.r[index]
-    x, y, tolerance = r * cosine[segment], r * sine[segment], tolerance_at(r)
-    z, weight, lowest_z = candidates.z[index], weight_at(r), candidates.z[alone[cell]]
-    return LowestPoints(x, y, z, r, tolerance, 1.0 / tolerance, weight, cell, lowest_z, is_alone)
+    r, z, segment, n_segments = *candidates[:2], candidates.segment, candidates.n_segments
+    near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
+    ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
+    cell = (segment[near] * N_SECTORS // n_segments) * N_RINGS + ring
+    # Equally low and near ones stay in order of their segments.
+    order = np.lexsort((r[near], z[near], cell))
+    near, cell = near[order], cell[order]
+    k = N_TOGETHER - 1
+    low, high = near[:-k], near[k:]
+    is_together = (cell[:-k] == cell[k:]) & (z[high] - z[low] <= tolerance_at(r[low]))
+    first, together = np.flatnonzero(is_new(cell)), np.flatnonzero(is_together)
+    together = together[is_new(cell[together])]
+    lowest, is_alone = near[first], np.ones(len(first), dtype=np.bool_)
+    occupied, lowest_z = cell[first], z[lowest]
+    place = np.searchsorted(occupied, cell[together])
+    lowest[place], is_alone[place] = near[together], False
+    columns = r[lowest], z[lowest], lowest_z, occupied, is_alone, segment[lowest]
+    return cells_of(n_segments, *columns)
+
+
+def cells_of(
+    n_segments: int,
+    r: FloatArray,
+    z: FloatArray,
+    lowest_z: FloatArray,
+    cell: IntArray,
+    is_alone: BoolArray,
+    segment: IntArray,
+) -> LowestPoints:
+    """Lowest points, each in the middle of its segment."""
+    cosine, sine = segment_directions(n_segments)[:, segment]
+    tolerance, weight = tolerance_at(r), np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
+    return LowestPoints(
+        r * cosine, r * sine, z, r, tolerance, 1.0 / tolerance, weight, cell, lowest_z, is_alone
+    )
 
 
 @shared
@@ -136,33 +162,10 @@ def tolerance_at(r: Values) -> Values:
 
 
 @shared
-def weight_at(r: Values) -> Values:
-    """Weight of a point at range `r`: largest, one, at `MIDDLE`."""
-    share = choose(r < MIDDLE, r, MIDDLE) / choose(r < MIDDLE, MIDDLE, r)
+def nearness(r: Values) -> Values:
+    """Weight of what is at a range, as what carries the robot: the largest, one, to `MIDDLE`."""
+    share = MIDDLE / np.maximum(r, MIDDLE)
     return share * share
-
-
-def _lowest(offsets: IntArray, r: FloatArray, z: FloatArray) -> tuple[IntArray, IntArray]:
-    """Index of the lowest candidate of each cell, sector by sector, or `_NONE`.
-
-    First of all, then of those that have `N_TOGETHER` - 1 more above them.
-    """
-    near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
-    n_segments = len(offsets) - 1
-    segment = np.repeat(np.arange(n_segments), np.diff(offsets))[near]
-    ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
-    cell = (segment * N_SECTORS // n_segments) * N_RINGS + ring
-    # Equally low and near ones stay in order of their segments.
-    order = np.lexsort((r[near], z[near], cell))
-    near, cell = near[order], cell[order]
-    k = N_TOGETHER - 1
-    low, high = near[:-k], near[k:]
-    is_together = (cell[:-k] == cell[k:]) & (z[high] - z[low] <= tolerance_at(r[low]))
-    alone, together = np.full((2, N_CELLS), _NONE)
-    for lowest, found in ((alone, np.arange(len(cell))), (together, np.flatnonzero(is_together))):
-        occupied, first = np.unique(cell[found], return_index=True)
-        lowest[occupied] = near[found[first]]
-    return alone, together
 
 
 class GroundPlane(NamedTuple):
@@ -174,7 +177,7 @@ class GroundPlane(NamedTuple):
     # as `height`, for the parallel plane through the middle of the near cells [m]
     near_height: float = 0.0
     support: float = 0.0  # share of the cells that lie on it
-    near_support: float = 0.0  # the same of their weights, see `weight_at`
+    near_support: float = 0.0  # the same of their weights
     coverage: float = 0.0  # share of all sectors around the sensor with such a cell
     reach: float = 0.0  # range within which nine of ten of these cells are [m]
     # angle at which the sensor sees nine of ten of these below the plane through it that is
@@ -200,10 +203,15 @@ class GroundPlane(NamedTuple):
         return z - (self.slope_x * x + self.slope_y * y - self.height)
 
     @property
-    def normal(self) -> Direction:
-        """Upward unit normal."""
-        length = math.sqrt(self.slope_x**2 + self.slope_y**2 + 1.0)
-        return -self.slope_x / length, -self.slope_y / length, 1.0 / length
+    def normal(self) -> FloatArray:
+        """Upward unit normal, (3,)."""
+        normal = np.array([-self.slope_x, -self.slope_y, 1.0])
+        return normal / math.sqrt(self.slope_x**2 + self.slope_y**2 + 1.0)
+
+    @property
+    def is_below_sensor(self) -> bool:
+        """Whether a sensor at the origin may see it: it sees the nearest of the ground steeply."""
+        return self.depression >= MIN_DEPRESSION
 
 
 def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
@@ -335,13 +343,6 @@ def carries(cells: LowestPoints, over: Plane, best: Plane, support: float) -> bo
     if n_over == 0 or told <= told_other or support < TIGHT * RESOLUTION * whole:
         return False
     return math.hypot(x / n_over - seen_x / n_seen, y / n_over - seen_y / n_seen) < ASIDE
-
-
-@shared
-def nearness(r: Values) -> Values:
-    """Weight of what is at a range, as what carries the robot: the largest, one, to `MIDDLE`."""
-    share = MIDDLE / np.maximum(r, MIDDLE)
-    return share * share
 
 
 @shared

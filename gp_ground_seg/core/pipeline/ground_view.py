@@ -10,7 +10,7 @@ import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Scan, as_index
 from gp_ground_seg.core.pipeline.ground_plane import FARTHEST, GroundPlane, tolerance_at
-from gp_ground_seg.core.pipeline.points import Direction, angles_of, rotation, turned_back
+from gp_ground_seg.core.pipeline.points import angles_of, rotation
 
 MIN_SUPPORT = 0.35
 """Share of the lowest points on the plane from which a scan determines the tilt."""
@@ -91,9 +91,10 @@ class View(NamedTuple):
     is_mirror: bool = False  # whether what is below it are mirror images
 
     @property
-    def up(self) -> Direction:
-        """Normal of the plane, in the frame levelled by the parameters."""
-        return turned_back(self.plane.normal, self.turn)
+    def up(self) -> FloatArray:
+        """Normal of the plane, (3,), in the frame levelled by the parameters."""
+        up: FloatArray = self.turn.T @ self.plane.normal
+        return up
 
     @property
     def levelled(self) -> FloatArray:
@@ -103,7 +104,7 @@ class View(NamedTuple):
     @property
     def is_steep(self) -> bool:
         """Whether the plane is clearly tilted against the frame that it was fitted in."""
-        return self.plane.normal[2] < math.cos(STEEP)
+        return bool(self.plane.normal[2] < math.cos(STEEP))
 
     @property
     def is_well_supported(self) -> bool:

@@ -201,19 +201,9 @@ def rotation(roll: float, pitch: float) -> FloatArray:
 
     Sines and cosines of quarter turns are exact: axes swapped stay points swapped.
     """
-    (sr, cr), (sp, cp) = (_sine_cosine(angle) for angle in (roll, pitch))
+    parts = math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch)
+    sr, cr, sp, cp = (0.0 if abs(part) < 1e-12 else part for part in parts)
     return np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
-
-
-def _sine_cosine(angle: float) -> tuple[float, float]:
-    sine, cosine = math.sin(angle), math.cos(angle)
-    return (0.0 if abs(sine) < 1e-12 else sine), (0.0 if abs(cosine) < 1e-12 else cosine)
-
-
-def vertical(roll: float, pitch: float) -> Direction:
-    """Last row of `rotation`: the direction that is up, in the frame of the sensor."""
-    (sr, cr), (sp, cp) = _sine_cosine(roll), _sine_cosine(pitch)
-    return -sp, cp * sr, cp * cr
 
 
 def rotate(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
@@ -242,12 +232,6 @@ def angles_of(up: FloatArray | Direction) -> tuple[float, float]:
     across = math.hypot(up[1], up[2])
     roll = rounded(math.atan2(up[1], up[2])) if across > 1e-4 else 0.0
     return roll if roll > -rounded(math.pi) else -roll, rounded(math.atan2(-up[0], across))
-
-
-def turned_back(direction: Direction, matrix: FloatArray) -> Direction:
-    """Direction in the frame that the rotation `matrix` (3, 3) starts from."""
-    x, y, z = (matrix.T @ direction).tolist()
-    return x, y, z
 
 
 def rounded(value: float) -> float:
