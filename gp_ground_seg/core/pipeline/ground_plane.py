@@ -490,13 +490,12 @@ def solve_plane(moments: Moments, plane: Plane) -> Plane:
 def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundPlane | None:
     """Measure how well a plane is seen; None if no cell lies on it."""
     height, sector = plane[0], cells.cell // N_RINGS
-    d, z = distance(cells.x, cells.y, cells.z, plane), cells.z
-    is_first = is_new(sector)
-    is_over = (d > CLEARLY_OFF * cells.tolerance) & (z < 0.0) & is_first
+    d, is_first = distance(cells.x, cells.y, cells.z, plane), is_new(sector)
+    is_over = (d > CLEARLY_OFF * cells.tolerance) & (cells.z < 0.0) & is_first
     # Floor at the foot of a wall lies alone.
     is_off = np.abs(d) > cells.tolerance
     lowest = distance(cells.x, cells.y, cells.lowest_z, plane)
-    d, z = np.where(is_off, lowest, d), np.where(is_off, cells.lowest_z, z)
+    d, z = np.where(is_off, lowest, d), np.where(is_off, cells.lowest_z, cells.z)
     is_on = np.abs(d) <= cells.tolerance
     n = int(np.count_nonzero(is_on))
     if n == 0:

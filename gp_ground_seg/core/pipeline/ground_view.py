@@ -72,14 +72,10 @@ FAR_OFF, TINY, HUGE = 10.0, 0.5, 200.0
 of nearly all [m] below which a cloud is not in metres; of half of them, above which it is not, if
 the farthest are ten times as far as the nearest."""
 
-_QUARTER = math.pi / 2.0
 UPRIGHT, *OTHER_AXES = (
-    rotation(*angles)
-    for angles in (
-        (0.0, 0.0), (math.pi, 0.0), (_QUARTER, 0.0), (-_QUARTER, 0.0), (0.0, _QUARTER),
-        (0.0, -_QUARTER),
-    )
-)  # fmt: skip
+    rotation(0.5 * math.pi * roll, 0.5 * math.pi * pitch)
+    for roll, pitch in ((0, 0), (2, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
+)
 """Rotations (3, 3) that turn z up, and each of the five other axes."""
 
 
