@@ -233,13 +233,12 @@ def _doubts(view: View) -> tuple[str, ...]:
 
 def _levelled(given: SensorPose, up: FloatArray, sensor: SensorConfig) -> SensorPose:
     """Return `given` with angles that turn `up` upwards, as far as those given allow."""
-    roll, pitch, is_free = given.roll, given.pitch, (sensor.roll == AUTO, sensor.pitch == AUTO)
-    if is_free[0]:
-        roll = rounded(math.atan2(up[1], up[2]))
-    if is_free[1]:
-        pitch = rounded(math.atan2(-up[0], up[1] * math.sin(roll) + up[2] * math.cos(roll)))
+    frees_roll, frees_pitch = sensor.roll == AUTO, sensor.pitch == AUTO
+    roll = rounded(math.atan2(up[1], up[2])) if frees_roll else given.roll
+    across = up[1] * math.sin(roll) + up[2] * math.cos(roll)
+    pitch = rounded(math.atan2(-up[0], across)) if frees_pitch else given.pitch
     return dataclasses.replace(
-        given, roll=roll, pitch=pitch, roll_estimated=is_free[0], pitch_estimated=is_free[1]
+        given, roll=roll, pitch=pitch, roll_estimated=frees_roll, pitch_estimated=frees_pitch
     )
 
 
