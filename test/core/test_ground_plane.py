@@ -103,8 +103,8 @@ def slow_support(plane, cells):
     """Support of a plane, cell by cell."""
     height, slope_x, slope_y = plane
     total = 0
-    for x, y, z, r, tolerance, *_ in zip(*cells, strict=True):
-        d = (z + height - slope_x * x - slope_y * y) / tolerance
+    for x, y, z, r, inverse, *_ in zip(*cells, strict=True):
+        d = (z + height - slope_x * x - slope_y * y) * inverse
         if abs(d) < 1.0:
             total += math.floor(4096.0 * slow_weight(r) * (1.0 - d**2))
     return total / (1.0 + slope_x**2 + slope_y**2) ** 2
@@ -116,12 +116,12 @@ def slow_refutation(plane, cells):
     height = above
     d = cells.z + height - slope_x * cells.x - slope_y * cells.y
     stopped = {
-        int(c) for c, e, t in zip(cells.cell, d, cells.tolerance, strict=True) if abs(e) < t
+        int(c) for c, e, t in zip(cells.cell, d, cells.inverse, strict=True) if abs(e * t) < 1.0
     }
     total = 0
-    rays = zip(cells.r, -d, cells.tolerance, cells.cell, cells.is_alone, strict=True)
-    for r, depth, tolerance, cell, is_alone in rays:
-        if depth <= 2.0 * tolerance or is_alone:
+    rays = zip(cells.r, -d, cells.inverse, cells.cell, cells.is_alone, strict=True)
+    for r, depth, inverse, cell, is_alone in rays:
+        if depth * inverse <= 2.0 or is_alone:
             continue
         crossing = r * above / (above + depth) if above > 0.0 else r
         sector = cell // N_RINGS

@@ -93,8 +93,8 @@ class LowestPoints(NamedTuple):
     y: FloatArray  # (C,) [m]
     z: FloatArray  # (C,) along the axis that is taken to be up [m]
     r: FloatArray  # (C,) horizontal range [m]
-    tolerance: FloatArray  # (C,) distance to the plane that the point still supports [m]
-    inverse: FloatArray  # (C,) one over the tolerance [1/m]
+    # (C,) one over the distance to a plane that the point still supports [1/m]
+    inverse: FloatArray
     weight: FloatArray  # (C,) the largest, one, at `MIDDLE`
     cell: IntArray  # (C,) number of the cell: sector times `N_RINGS`, plus ring
     # (C,) height of the lowest of all [m], which may lie alone: floor at the foot of a wall
@@ -149,10 +149,9 @@ def cells_of(
 ) -> LowestPoints:
     """Lowest points, each in the middle of its segment."""
     cosine, sine = segment_directions(n_segments)[:, segment]
-    tolerance, weight = tolerance_at(r), np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
-    return LowestPoints(
-        r * cosine, r * sine, z, r, tolerance, 1.0 / tolerance, weight, cell, lowest_z, is_alone
-    )
+    x, y, inverse = r * cosine, r * sine, 1.0 / tolerance_at(r)
+    weight = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
+    return LowestPoints(x, y, z, r, inverse, weight, cell, lowest_z, is_alone)
 
 
 @shared
@@ -331,10 +330,10 @@ def carries(cells: LowestPoints, over: Plane, best: Plane, support: float) -> bo
         if sector != last:
             n_seen, last = n_seen + 1, sector
             seen_x, seen_y = seen_x + cosine, seen_y + sine
-        is_on = abs(distance(cells.x[c], cells.y[c], cells.z[c], over)) <= cells.tolerance[c]
+        place, inverse = (cells.x[c], cells.y[c], cells.z[c]), cells.inverse[c]
+        is_on = abs(distance(*place, over) * inverse) <= 1.0
         whole += cells.weight[c] if is_on else 0.0
-        is_on_best = abs(distance(cells.x[c], cells.y[c], cells.z[c], best)) <= cells.tolerance[c]
-        if sector != last_told and (is_on or is_on_best):
+        if sector != last_told and (is_on or abs(distance(*place, best) * inverse) <= 1.0):
             last_told, weight = sector, nearness(r) ** 2
             if is_on:
                 n_over, x, y, told = n_over + 1, x + cosine, y + sine, told + weight
@@ -489,14 +488,13 @@ def solve_plane(moments: Moments, plane: Plane) -> Plane:
 
 def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundPlane | None:
     """Measure how well a plane is seen; None if no cell lies on it."""
-    height, sector = plane[0], cells.cell // N_RINGS
+    height, sector, inverse = plane[0], cells.cell // N_RINGS, cells.inverse
     d, is_first = distance(cells.x, cells.y, cells.z, plane), is_new(sector)
-    is_over = (d > CLEARLY_OFF * cells.tolerance) & (cells.z < 0.0) & is_first
+    is_over = (d * inverse > CLEARLY_OFF) & (cells.z < 0.0) & is_first
     # Floor at the foot of a wall lies alone.
-    is_off = np.abs(d) > cells.tolerance
-    lowest = distance(cells.x, cells.y, cells.lowest_z, plane)
+    is_off, lowest = np.abs(d * inverse) > 1.0, distance(cells.x, cells.y, cells.lowest_z, plane)
     d, z = np.where(is_off, lowest, d), np.where(is_off, cells.lowest_z, cells.z)
-    is_on = np.abs(d) <= cells.tolerance
+    is_on = np.abs(d * inverse) <= 1.0
     n = int(np.count_nonzero(is_on))
     if n == 0:
         return None
