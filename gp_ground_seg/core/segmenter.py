@@ -38,6 +38,7 @@ from gp_ground_seg.core.pipeline.ground_view import (
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
 from gp_ground_seg.core.pipeline.mirror_images import (
     MIRRORED,
+    NO_IMAGES,
     MirrorImages,
     find_mirror_images,
     in_sight,
@@ -271,7 +272,7 @@ class GroundSegmenter:
             nothing = np.zeros(len(scan.candidates.r), dtype=np.bool_)
             scan = scan._replace(candidates=scan.candidates.where(nothing))
         is_dry = below is not None and not (below.is_mirror or below.may_be_image)
-        images = MirrorImages.none() if is_dry else find_mirror_images(scan, pose)
+        images = NO_IMAGES if is_dry else find_mirror_images(scan, pose)
         if len(images.points) > 0:
             scan = images.left_out(backend.build_grid(images.raised(scan.xyz), config))
         timer.mark('pose')
@@ -310,9 +311,8 @@ class GroundSegmenter:
             below = look(below.levelled) or below
         if not is_doubtful(below):
             return below
-        first = [view for view in map(look, OTHER_AXES) if view is not None]
-        again = (look(view.levelled) for view in first)
-        return clearest(below, [view for view in again if view is not None])
+        first = map(look, OTHER_AXES)
+        return clearest(below, [look(view.levelled) if view else None for view in first])
 
 
 def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[float, ...]:

@@ -1,16 +1,20 @@
-"""Loops of `gp_ground_seg.core.pipeline.ground_plane`, and a wet road, for compiled code."""
+"""Loops of `gp_ground_seg.core.pipeline.ground_plane` for compiled code."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray
+from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray
 from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import (
     CLEARLY_OFF,
     LEAST_REACH,
     MAX_Z,
+    MIN_CELLS,
+    N_CELLS,
     N_RINGS,
     N_SECTORS,
     N_TOGETHER,
@@ -19,53 +23,45 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     LowestPoints,
     Moments,
     Plane,
+    cells_of,
     crossed_at,
+    described,
     distance,
     fit_cells,
     levelness,
     refutation_by,
-    segment_directions,
     support_by,
     tolerance_at,
     tukey_weight,
-    weight_at,
 )
-
-WIDTH = 32
-"""The number of points ends at a multiple of it, so that no loop over them has a remainder."""
-N_CELLS = N_SECTORS * N_RINGS
-N_LARGEST = -(-N_CELLS // WIDTH) * WIDTH
-_OUT_OF_REACH = 1e6
-
-# Ring at the start of each stretch of range, a little early because of rounding: a range in the
-# stretch lies in that ring or the next, as the narrowest ring is four stretches wide.
-_PER_METRE = 4.0 / float(RING_EDGES[1] - RING_EDGES[0])
-_STARTS = RING_EDGES[0] + (np.arange(int(RING_EDGES[-1] * _PER_METRE) + 1) - 0.02) / _PER_METRE
-_RING_TABLE = np.clip(np.searchsorted(RING_EDGES, _STARTS, side='right') - 1, 0, N_RINGS - 1)
 
 
 @jit(entry=True)
-def _fit_cells(cells: LowestPoints, n: int, max_slope: float) -> tuple[float, ...]:
-    """Fields of the `GroundPlane`."""
-    return fit_cells(cells, n, max_slope)[:]
+def _fit_cells(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
+    return fit_cells(cells, max_slope)
 
 
 def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     """Do what `gp_ground_seg.core.pipeline.ground_plane.fit_plane` does, to rounding."""
-    directions = segment_directions(len(candidates.offsets) - 1)
-    x, y, z, r, tolerance, inverse, weight, lowest_z = np.empty((8, N_LARGEST))
-    number = np.empty(N_LARGEST, dtype=np.int64)
-    is_alone = np.zeros(N_LARGEST, dtype=np.bool_)
-    cells = LowestPoints(x, y, z, r, tolerance, inverse, weight, number, lowest_z, is_alone)
-    n = _tabulate(candidates, directions, cells)
-    cells = LowestPoints._make(column[: -(-n // WIDTH) * WIDTH] for column in cells)
-    plane = GroundPlane(*_fit_cells(cells, n, max_slope))  # type: ignore[arg-type]
-    return plane if plane.n_support > 0 else None
+    r, z, lowest_z = np.empty((3, N_CELLS))
+    number, segment = np.empty((2, N_CELLS), dtype=np.int64)
+    columns: tuple[Any, ...] = r, z, lowest_z, number, np.empty(N_CELLS, np.bool_), segment
+    n = _tabulate(candidates, *columns)
+    cells = cells_of(candidates.n_segments, *(column[:n] for column in columns))
+    return described(cells, *_fit_cells(cells, max_slope)) if n >= MIN_CELLS else None
 
 
 @jit(entry=True)
-def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoints) -> int:
-    """Set the lowest points, and those behind them to count for nothing; return their number."""
+def _tabulate(
+    candidates: Candidates,
+    low_r: FloatArray,
+    low_z: FloatArray,
+    lowest_z: FloatArray,
+    number: IntArray,
+    is_alone: BoolArray,
+    segment: IntArray,
+) -> int:
+    """Set the columns that `cells_of` takes; return the number of cells."""
     offsets, r, z = candidates.offsets, candidates.r, candidates.z
     n_segments = len(offsets) - 1
     cell_of, starts = np.empty(len(r), np.int64), np.zeros(N_CELLS + 1, np.int64)
@@ -74,8 +70,7 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
         for c in range(offsets[m], offsets[m + 1]):
             cell_of[c] = -1
             if RING_EDGES[0] <= r[c] < RING_EDGES[N_RINGS] and abs(z[c]) < MAX_Z:
-                ring = _RING_TABLE[int((r[c] - RING_EDGES[0]) * _PER_METRE)]
-                cell_of[c] = first + ring + (1 if r[c] >= RING_EDGES[ring + 1] else 0)
+                cell_of[c] = first + np.searchsorted(RING_EDGES, r[c], side='right') - 1
                 starts[cell_of[c] + 1] += 1
     for cell in range(N_CELLS):
         starts[cell + 1] += starts[cell]
@@ -94,17 +89,9 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
             first, end = starts[cell], ends[cell]
             _sort(near_r, near_z, home, first, end)
             k = _lowest_together(near_r, near_z, first, end)
-            cells.is_alone[n], k = k < 0, max(k, first)
-            cells.lowest_z[n] = near_z[first]
-            range_, m = near_r[k], home[k]
-            cells.x[n], cells.y[n] = range_ * directions[0, m], range_ * directions[1, m]
-            cells.z[n], cells.r[n] = near_z[k], range_
-            cells.tolerance[n], cells.weight[n] = tolerance_at(range_), weight_at(range_)
-            cells.inverse[n], cells.cell[n] = 1.0 / cells.tolerance[n], cell
+            is_alone[n], k, lowest_z[n], number[n] = k < 0, max(k, first), near_z[first], cell
+            low_r[n], low_z[n], segment[n] = near_r[k], near_z[k], home[k]
             n += 1
-    for c in range(n, -(-n // WIDTH) * WIDTH):
-        cells.x[c], cells.y[c], cells.z[c] = 0.0, 0.0, _OUT_OF_REACH
-        cells.inverse[c], cells.weight[c] = 1.0, 0.0
     return n
 
 
@@ -153,27 +140,22 @@ def _support_of(plane: Plane, cells: LowestPoints) -> float:
 
 
 @compiled_form(ground_plane.refutation_of)
-def refutation_of(plane: Plane, cells: LowestPoints, n: int) -> float:
+def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     """Weight of the rays that cross a plane where it should have stopped them."""
-    total = 0.0
-    is_seen, reach, heights = np.zeros(N_CELLS, np.bool_), np.empty(N_SECTORS), np.empty(n)
-    for sector in range(N_SECTORS):
-        reach[sector] = LEAST_REACH
-    for c in range(n):
+    total, heights = 0.0, np.empty(len(cells.z))
+    is_seen, reach = np.zeros(N_CELLS, np.bool_), np.full(N_SECTORS, LEAST_REACH)
+    for c in range(len(heights)):
         heights[c] = distance(cells.x[c], cells.y[c], cells.z[c], plane)
         if abs(heights[c] * cells.inverse[c]) < 1.0:
             sector = cells.cell[c] // N_RINGS
             is_seen[cells.cell[c]], reach[sector] = True, max(reach[sector], cells.r[c])
-    for c in range(n):
+    for c in range(len(heights)):
         if heights[c] * cells.inverse[c] < -CLEARLY_OFF and not cells.is_alone[c]:
             sector = cells.cell[c] // N_RINGS
             crossing = crossed_at(cells.r[c], heights[c], plane[0])
-            if crossing < reach[sector]:
-                ring = 0
-                while ring < N_RINGS - 1 and crossing >= RING_EDGES[ring + 1]:
-                    ring += 1
-                if not is_seen[sector * N_RINGS + ring]:
-                    total += refutation_by(crossing)
+            ring = np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
+            if crossing < reach[sector] and not is_seen[sector * N_RINGS + ring]:
+                total += refutation_by(crossing)
     return total
 
 
@@ -194,25 +176,3 @@ def weighted_moments(cells: LowestPoints, plane: Plane) -> Moments:
         wxz += weight * x * z
         wyz += weight * y * z
     return w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz
-
-
-@compiled_form(ground_plane.ranked)
-def ranked(values: FloatArray, rank: int) -> float:
-    """Value at `rank` in sorted order, by Hoare's selection, which reorders the values."""
-    low, high = 0, len(values) - 1
-    while low < high:
-        pivot, i, j = values[rank], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i, j = i + 1, j - 1
-        if j < rank:
-            low = i
-        if rank < i:
-            high = j
-    value: float = values[rank]
-    return value

@@ -11,7 +11,6 @@ import numpy as np
 from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray, Values
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import SENSOR_HEIGHTS
-from gp_ground_seg.core.pipeline.points import Direction
 
 N_SECTORS = 36
 NEAREST, FARTHEST = 0.5, 40.0
@@ -31,7 +30,7 @@ MAX_Z = 65.0
 
 N_RINGS = math.ceil(math.log(FARTHEST / NEAREST) / math.log(RING_RATIO))
 RING_EDGES = NEAREST * RING_RATIO ** np.arange(N_RINGS + 1.0)
-_NONE = -1
+N_CELLS = N_SECTORS * N_RINGS
 
 NEAR, ENOUGH_NEAR = 8.0, 12
 """Range [m] and least number of the points that the height is measured at: kerbs and verges
@@ -47,8 +46,6 @@ farther ones another level than the one that it stands on."""
 LEAST_REACH = 1.5
 """Range to which rays may not cross the ground in any direction [m]: edges of a jetty may be that
 near."""
-BODY_REACH = 3.0
-"""Range that the ground reaches, and the robot's own body does not [m]."""
 REFUTATION = 8.0
 """Weight of a ray that crosses the plane over that of a point on it at `MIDDLE`."""
 APART, PARALLEL = 0.3, 0.06
@@ -72,12 +69,14 @@ from which the tilt explains nothing: shelves on one side and floor on the other
 Plane = tuple[float, float, float]
 """Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
 
+MIN_DEPRESSION = 0.105
+"""Angle to the plane of the ground at which a sensor sees the nearest of it, at least [rad]. From
+the origin of a vehicle, at its axles, a sensor on the roof seems to see it at less."""
+
 N_TRIPLES = 192
 """Planes tried through three cells each."""
 N_LEVEL = 64
 """Level planes tried, at most."""
-MIN_AREA = 0.1
-"""Twice the area, seen from above, from which three cells make a plane [m^2]."""
 LOOSER = 1.1
 """Largest slope of a refined plane over that of the hypotheses."""
 RESOLUTION = 4096.0
@@ -88,18 +87,15 @@ MIN_CELLS = 3
 
 
 class LowestPoints(NamedTuple):
-    """Lowest point of each occupied cell: sectors by rings, rings wider the farther they are.
-
-    Compiled code has more entries than cells, see `gp_ground_seg.core.compiled.ground_plane`.
-    """
+    """Lowest point of each occupied cell: sector by sector, rings wider the farther they are."""
 
     x: FloatArray  # (C,) [m]
     y: FloatArray  # (C,) [m]
     z: FloatArray  # (C,) along the axis that is taken to be up [m]
     r: FloatArray  # (C,) horizontal range [m]
-    tolerance: FloatArray  # (C,) distance to the plane that the point still supports [m]
-    inverse: FloatArray  # (C,) one over the tolerance [1/m]
-    weight: FloatArray  # (C,) see `weight_at`
+    # (C,) one over the distance to a plane that the point still supports [1/m]
+    inverse: FloatArray
+    weight: FloatArray  # (C,) the largest, one, at `MIDDLE`
     cell: IntArray  # (C,) number of the cell: sector times `N_RINGS`, plus ring
     # (C,) height of the lowest of all [m], which may lie alone: floor at the foot of a wall
     lowest_z: FloatArray
@@ -120,19 +116,42 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
 
     It is the lowest that has `N_TOGETHER` - 1 more within its tolerance above it; where there is
     none, the lowest. Of equally low ones the nearest comes first, then that of the first segment,
-    so that the order of the points does not matter. A point's azimuth is taken to be that of the
-    middle of its segment.
+    so that the order of the points does not matter.
     """
-    alone, together = _lowest(candidates.offsets, candidates.r, candidates.z)
-    cell = np.flatnonzero(alone != _NONE)
-    is_alone = together[cell] == _NONE
-    index = np.where(is_alone, alone[cell], together[cell])
-    segment = np.searchsorted(candidates.offsets, index, side='right') - 1
-    cosine, sine = segment_directions(len(candidates.offsets) - 1)
-    r = candidates.r[index]
-    x, y, tolerance = r * cosine[segment], r * sine[segment], tolerance_at(r)
-    z, weight, lowest_z = candidates.z[index], weight_at(r), candidates.z[alone[cell]]
-    return LowestPoints(x, y, z, r, tolerance, 1.0 / tolerance, weight, cell, lowest_z, is_alone)
+    r, z, segment, n_segments = *candidates[:2], candidates.segment, candidates.n_segments
+    near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
+    ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
+    cell = (segment[near] * N_SECTORS // n_segments) * N_RINGS + ring
+    # Equally low and near ones stay in order of their segments.
+    order = np.lexsort((r[near], z[near], cell))
+    near, cell = near[order], cell[order]
+    k = N_TOGETHER - 1
+    low, high = near[:-k], near[k:]
+    is_together = (cell[:-k] == cell[k:]) & (z[high] - z[low] <= tolerance_at(r[low]))
+    first, together = np.flatnonzero(is_new(cell)), np.flatnonzero(is_together)
+    together = together[is_new(cell[together])]
+    lowest, is_alone = near[first], np.ones(len(first), dtype=np.bool_)
+    occupied, lowest_z = cell[first], z[lowest]
+    place = np.searchsorted(occupied, cell[together])
+    lowest[place], is_alone[place] = near[together], False
+    columns = r[lowest], z[lowest], lowest_z, occupied, is_alone, segment[lowest]
+    return cells_of(n_segments, *columns)
+
+
+def cells_of(
+    n_segments: int,
+    r: FloatArray,
+    z: FloatArray,
+    lowest_z: FloatArray,
+    cell: IntArray,
+    is_alone: BoolArray,
+    segment: IntArray,
+) -> LowestPoints:
+    """Lowest points, each in the middle of its segment."""
+    cosine, sine = segment_directions(n_segments)[:, segment]
+    x, y, inverse = r * cosine, r * sine, 1.0 / tolerance_at(r)
+    weight = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
+    return LowestPoints(x, y, z, r, inverse, weight, cell, lowest_z, is_alone)
 
 
 @shared
@@ -142,37 +161,14 @@ def tolerance_at(r: Values) -> Values:
 
 
 @shared
-def weight_at(r: Values) -> Values:
-    """Weight of a point at range `r`: largest, one, at `MIDDLE`."""
-    share = choose(r < MIDDLE, r, MIDDLE) / choose(r < MIDDLE, MIDDLE, r)
+def nearness(r: Values) -> Values:
+    """Weight of what is at a range, as what carries the robot: the largest, one, to `MIDDLE`."""
+    share = MIDDLE / np.maximum(r, MIDDLE)
     return share * share
 
 
-def _lowest(offsets: IntArray, r: FloatArray, z: FloatArray) -> tuple[IntArray, IntArray]:
-    """Index of the lowest candidate of each cell, sector by sector, or `_NONE`.
-
-    First of all, then of those that have `N_TOGETHER` - 1 more above them.
-    """
-    near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
-    n_segments = len(offsets) - 1
-    segment = np.repeat(np.arange(n_segments), np.diff(offsets))[near]
-    ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
-    cell = (segment * N_SECTORS // n_segments) * N_RINGS + ring
-    # Equally low and near ones stay in order of their segments.
-    order = np.lexsort((r[near], z[near], cell))
-    near, cell = near[order], cell[order]
-    k = N_TOGETHER - 1
-    low, high = near[:-k], near[k:]
-    is_together = (cell[:-k] == cell[k:]) & (z[high] - z[low] <= tolerance_at(r[low]))
-    alone, together = np.full((2, N_SECTORS * N_RINGS), _NONE)
-    for lowest, found in ((alone, np.arange(len(cell))), (together, np.flatnonzero(is_together))):
-        occupied, first = np.unique(cell[found], return_index=True)
-        lowest[occupied] = near[found[first]]
-    return alone, together
-
-
 class GroundPlane(NamedTuple):
-    """The plane z = -height + slope_x x + slope_y y; `NO_PLANE` if no cell lies on any."""
+    """The plane z = -height + slope_x x + slope_y y, and how well it is seen."""
 
     height: float = 0.0  # how far below the sensor it is, along z [m]
     slope_x: float = 0.0  # rise per metre
@@ -180,7 +176,7 @@ class GroundPlane(NamedTuple):
     # as `height`, for the parallel plane through the middle of the near cells [m]
     near_height: float = 0.0
     support: float = 0.0  # share of the cells that lie on it
-    near_support: float = 0.0  # the same of their weights, see `weight_at`
+    near_support: float = 0.0  # the same of their weights
     coverage: float = 0.0  # share of all sectors around the sensor with such a cell
     reach: float = 0.0  # range within which nine of ten of these cells are [m]
     # angle at which the sensor sees nine of ten of these below the plane through it that is
@@ -206,13 +202,15 @@ class GroundPlane(NamedTuple):
         return z - (self.slope_x * x + self.slope_y * y - self.height)
 
     @property
-    def normal(self) -> Direction:
-        """Upward unit normal."""
-        length = math.sqrt(self.slope_x**2 + self.slope_y**2 + 1.0)
-        return -self.slope_x / length, -self.slope_y / length, 1.0 / length
+    def normal(self) -> FloatArray:
+        """Upward unit normal, (3,)."""
+        normal = np.array([-self.slope_x, -self.slope_y, 1.0])
+        return normal / math.sqrt(self.slope_x**2 + self.slope_y**2 + 1.0)
 
-
-NO_PLANE = GroundPlane()
+    @property
+    def is_below_sensor(self) -> bool:
+        """Whether a sensor at the origin may see it: it sees the nearest of the ground steeply."""
+        return self.depression >= MIN_DEPRESSION
 
 
 def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
@@ -224,23 +222,16 @@ def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     steepest plane to look for, as rise per metre.
     """
     cells = lowest_points(candidates)
-    plane = fit_cells(cells, len(cells.z), max_slope)
-    return plane if plane.n_support > 0 else None
+    return described(cells, *fit_cells(cells, max_slope)) if len(cells.z) >= MIN_CELLS else None
 
 
 @shared
-def fit_cells(cells: LowestPoints, n: int, max_slope: float) -> GroundPlane:
-    """Fit a plane to the first `n` points."""
-    if n < MIN_CELLS:
-        return NO_PLANE
-    best, score, other = own_level(cells, n, max_slope)
-    if score <= 0.0:
-        return NO_PLANE
+def fit_cells(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
+    """Fit a plane to the lowest points; return it, and the height of another level or infinity."""
+    best, other = own_level(cells, max_slope)
     plane = refined(cells, best)
-    if not is_possible(plane, LOOSER * max_slope):
-        # The refinement has drifted off to a plane that cannot be the ground.
-        plane = best
-    return described(cells, n, plane, other)
+    # The refinement may drift off to a plane that cannot be the ground.
+    return plane if is_possible(plane, LOOSER * max_slope) else best, other
 
 
 def _spread(n: int) -> FloatArray:
@@ -259,39 +250,37 @@ SPREAD = _spread(N_TRIPLES)
 
 
 @shared
-def own_level(cells: LowestPoints, n: int, max_slope: float) -> tuple[Plane, float, float]:
-    """Plane of the level that the robot stands on, its score or 0, and another's height or inf.
+def own_level(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
+    """Plane of the level that the robot stands on, and height of another level or infinity.
 
-    It is the plane with the best score, or a parallel one over it that is not refuted and lies
-    around the robot: the top of a dock, of which less is seen than of what lies below it.
+    It is the plane with the best score, or a parallel one over it that is not refuted and carries
+    the robot: the top of a dock, of which less is seen than of what lies below it.
     """
-    planes = hypotheses(cells, n, max_slope)
+    planes = hypotheses(cells, max_slope)
     supports = supports_of(planes, cells)
-    best, score, _ = best_of(planes, supports, cells, n, 0.0)
-    if score <= 0.0:
-        return best, 0.0, math.inf
     height, slope_x, slope_y = planes[:, 0], planes[:, 1], planes[:, 2]
+    best, score, _ = best_of(planes, supports, cells, 0.0)
     if 0.0 < math.hypot(best[1], best[2]) < STRAIGHT:
-        levels = np.where(np.hypot(slope_x, slope_y) == 0.0, supports, 0.0)
-        level, level_score, _ = best_of(planes, levels, cells, n, LEVEL_SHARE * score)
+        levels = np.where((slope_x == 0.0) & (slope_y == 0.0), supports, 0.0)
+        level, level_score, _ = best_of(planes, levels, cells, LEVEL_SHARE * score)
         if level_score > 0.0:
             best, score = level, level_score
-    is_parallel = np.hypot(slope_x - best[1], slope_y - best[2]) < PARALLEL
-    is_over = is_parallel & (height > 0.0) & (height < best[0] - APART)
-    levels = np.where(is_over, supports, 0.0)
-    over, over_score, support = best_of(planes, levels, cells, n, OTHER_SHARE * score)
-    if over_score > CLEAN * support and is_around(cells, n, over, best, support):
-        return over, over_score, best[0]
-    levels = np.where(is_parallel & (height > best[0] + APART), supports, 0.0)
-    under, under_score, _ = best_of(planes, levels, cells, n, OTHER_SHARE * score)
-    other = over if over_score > under_score else under
-    return best, score, other[0] if max(over_score, under_score) > 0.0 else math.inf
+    is_other = np.hypot(slope_x - best[1], slope_y - best[2]) < PARALLEL
+    is_other &= (np.abs(height - best[0]) > APART) & (height > min(best[0], 0.0))
+    others, least = np.where(is_other, supports, 0.0), OTHER_SHARE * score
+    higher = np.where(height < best[0], others, 0.0)
+    over, over_score, support = best_of(planes, higher, cells, least)
+    if over_score > CLEAN * support and carries(cells, over, best, support):
+        return over, best[0]
+    other, other_score, _ = best_of(planes, others, cells, least)
+    return best, other[0] if other_score > 0.0 else math.inf
 
 
 @shared
-def hypotheses(cells: LowestPoints, n: int, max_slope: float) -> FloatArray:
+def hypotheses(cells: LowestPoints, max_slope: float) -> FloatArray:
     """Level planes through some of the points, and planes through three, (P, 3)."""
-    n_level, n_planes = min(n, N_LEVEL), 0
+    n, n_planes = len(cells.z), 0
+    n_level = min(n, N_LEVEL)
     planes = np.empty((n_level + len(SPREAD), 3))
     for t in range(len(planes)):
         if t < n_level:
@@ -306,46 +295,12 @@ def hypotheses(cells: LowestPoints, n: int, max_slope: float) -> FloatArray:
 
 
 @shared
-def is_around(cells: LowestPoints, n: int, over: Plane, best: Plane, support: float) -> bool:
-    """Whether a level over another one lies on all sides, nearer than the other.
-
-    It reaches farther than the own body of the robot, and its `support` is that of one level, not
-    of cars of many heights.
-    """
-    x = y = seen_x = seen_y = reach = told = told_other = whole = 0.0
-    n_over, n_seen, last, last_told = 0, 0, -1, -1
-    for c in range(n):
-        # Cells come sector by sector, from near to far.
-        sector, r = cells.cell[c] // N_RINGS, cells.r[c]
-        cosine, sine = cells.x[c] / r, cells.y[c] / r
-        if sector != last:
-            n_seen, last = n_seen + 1, sector
-            seen_x, seen_y = seen_x + cosine, seen_y + sine
-        height = distance(cells.x[c], cells.y[c], cells.z[c], over)
-        is_on_it = abs(height) <= cells.tolerance[c]
-        if is_on_it:
-            reach, whole = max(reach, r), whole + cells.weight[c]
-        is_on_other = abs(distance(cells.x[c], cells.y[c], cells.z[c], best)) <= cells.tolerance[c]
-        if sector != last_told and (is_on_it or is_on_other):
-            last_told = sector
-            weight = weight_at(max(r, MIDDLE)) ** 2
-            if is_on_it:
-                n_over, x, y, told = n_over + 1, x + cosine, y + sine, told + weight
-            else:
-                told_other += weight
-    is_one_level = support >= TIGHT * RESOLUTION * whole
-    if n_over == 0 or reach < BODY_REACH or told <= told_other or not is_one_level:
-        return False
-    return math.hypot(x / n_over - seen_x / n_seen, y / n_over - seen_y / n_seen) < ASIDE
-
-
-@shared
 def plane_through(cells: LowestPoints, i: int, j: int, k: int) -> Plane:
-    """Plane through three points; infinitely high if they are too close to a line."""
+    """Plane through three points; infinitely high if they are on a line."""
     x1, y1, z1 = cells.x[j] - cells.x[i], cells.y[j] - cells.y[i], cells.z[j] - cells.z[i]
     x2, y2, z2 = cells.x[k] - cells.x[i], cells.y[k] - cells.y[i], cells.z[k] - cells.z[i]
     area = x1 * y2 - x2 * y1
-    if not abs(area) > MIN_AREA:
+    if area == 0.0:
         return math.inf, 0.0, 0.0
     slope_x, slope_y = (z1 * y2 - z2 * y1) / area, (x1 * z2 - x2 * z1) / area
     return slope_x * cells.x[i] + slope_y * cells.y[i] - cells.z[i], slope_x, slope_y
@@ -360,22 +315,53 @@ def is_possible(plane: Plane, max_slope: float) -> bool:
 
 
 @shared
+def carries(cells: LowestPoints, over: Plane, best: Plane, support: float) -> bool:
+    """Whether a level over another one is seen nearer than the other, and on all sides.
+
+    Its `support` is that of a single level: cars are of many heights, and little of what is within
+    the tolerance of a plane is close to it.
+    """
+    x = y = seen_x = seen_y = told = told_other = whole = 0.0
+    n_over, n_seen, last, last_told = 0, 0, -1, -1
+    for c in range(len(cells.z)):
+        # Cells come sector by sector, from near to far.
+        sector, r = cells.cell[c] // N_RINGS, cells.r[c]
+        cosine, sine = cells.x[c] / r, cells.y[c] / r
+        if sector != last:
+            n_seen, last = n_seen + 1, sector
+            seen_x, seen_y = seen_x + cosine, seen_y + sine
+        place, inverse = (cells.x[c], cells.y[c], cells.z[c]), cells.inverse[c]
+        is_on = abs(distance(*place, over) * inverse) <= 1.0
+        whole += cells.weight[c] if is_on else 0.0
+        if sector != last_told and (is_on or abs(distance(*place, best) * inverse) <= 1.0):
+            last_told, weight = sector, nearness(r) ** 2
+            if is_on:
+                n_over, x, y, told = n_over + 1, x + cosine, y + sine, told + weight
+            else:
+                told_other += weight
+    if n_over == 0 or told <= told_other or support < TIGHT * RESOLUTION * whole:
+        return False
+    return math.hypot(x / n_over - seen_x / n_seen, y / n_over - seen_y / n_seen) < ASIDE
+
+
+@shared
 def best_of(
-    planes: FloatArray, supports: FloatArray, cells: LowestPoints, n: int, least: float
+    planes: FloatArray, supports: FloatArray, cells: LowestPoints, least: float
 ) -> tuple[Plane, float, float]:
-    """Plane with the best score above `least`, its score, 0 if there is none, and its support.
+    """Plane with the best score above `least`, its score, and its support: NaN, 0, 0 without one.
 
     The score is the support, times the share of it in all evidence. It is at most the support, so
     that few planes need their refutation.
     """
-    left, best, best_score, best_support = supports.copy(), (0.0, 0.0, 0.0), 0.0, 0.0
+    best, best_score, best_support = (math.nan, math.nan, math.nan), 0.0, 0.0
+    left = supports.copy()
     while len(left) > 0:
         p = np.argmax(left)
         support = left[p]
         if support <= max(best_score, least):
             break
         plane = (planes[p, 0], planes[p, 1], planes[p, 2])
-        score = support * support / (support + refutation_of(plane, cells, n))
+        score = support * support / (support + refutation_of(plane, cells))
         if score > max(best_score, least):
             best, best_score, best_support = plane, score, support
         left[p] = -1.0
@@ -415,8 +401,8 @@ def support_by(
     return np.floor(choose(support > 0.0, support, 0.0))
 
 
-def refutation_of(plane: Plane, cells: LowestPoints, n: int) -> float:
-    """Weight of the rays that cross a plane where it should have stopped them.
+def refutation_of(plane: Plane, cells: LowestPoints) -> float:
+    """Weight of the rays that cross a plane where it should have stopped them; a whole number.
 
     These are rays to points clearly below it that do not lie alone. In a sector the plane is taken
     to reach as far as its farthest point, at least `LEAST_REACH`: over the edge of a dike or a
@@ -426,7 +412,7 @@ def refutation_of(plane: Plane, cells: LowestPoints, n: int) -> float:
     height = distance(cells.x, cells.y, cells.z, plane)
     d, sector = height * cells.inverse, cells.cell // N_RINGS
     is_on, is_below = np.abs(d) < 1.0, (d < -CLEARLY_OFF) & ~cells.is_alone
-    is_seen, reach = np.zeros(N_SECTORS * N_RINGS, dtype=bool), np.full(N_SECTORS, LEAST_REACH)
+    is_seen, reach = np.zeros(N_CELLS, dtype=np.bool_), np.full(N_SECTORS, LEAST_REACH)
     is_seen[cells.cell[is_on]] = True
     np.maximum.at(reach, sector[is_on], cells.r[is_on])
     sector = sector[is_below]
@@ -448,11 +434,8 @@ def crossed_at(r: Values, height: Values, clearance: float) -> Values:
 
 @shared
 def refutation_by(crossing: Values) -> Values:
-    """Refutation of a plane by a ray that crosses it at a range; a whole number.
-
-    What is crossed next to the robot does not carry it.
-    """
-    return np.floor(REFUTATION * RESOLUTION * weight_at(np.maximum(crossing, MIDDLE)))
+    """Refutation of a plane by a ray that crosses it at a range; a whole number."""
+    return np.floor(REFUTATION * RESOLUTION * nearness(crossing))
 
 
 @shared
@@ -503,58 +486,46 @@ def solve_plane(moments: Moments, plane: Plane) -> Plane:
     return slope_x * mx + slope_y * my - mz, slope_x, slope_y
 
 
-@shared
-def described(cells: LowestPoints, n: int, plane: Plane, other_height: float) -> GroundPlane:
-    """Measure how well a plane is seen."""
-    height, slope_x, slope_y = plane
-    ranges, drops, near, angles = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    n_on_it, n_near, weight, whole = 0, 0, 0.0, 0.0
-    n_seen = n_covered = n_overhung = 0
-    last_seen = last_covered = -1
-    for c in range(n):
-        sector, r = cells.cell[c] // N_RINGS, cells.r[c]
-        whole += cells.weight[c]
-        z = cells.z[c]
-        d = distance(cells.x[c], cells.y[c], z, plane)
-        # Cells come sector by sector: one that differs from the last is new.
-        if sector != last_seen:
-            n_seen, last_seen = n_seen + 1, sector
-            n_overhung += d > CLEARLY_OFF * cells.tolerance[c] and z < 0.0
-        if not abs(d) <= cells.tolerance[c]:
-            z = cells.lowest_z[c]
-            d = distance(cells.x[c], cells.y[c], z, plane)
-        if not abs(d) <= cells.tolerance[c]:
-            continue
-        ranges[n_on_it], drops[n_on_it] = r, math.atan2(-z, r)
-        angles[n_on_it] = math.atan2(height - d, r)
-        n_on_it += 1
-        weight += cells.weight[c]
-        if r < NEAR:
-            near[n_near] = d
-            n_near += 1
-        if sector != last_covered:
-            n_covered, last_covered = n_covered + 1, sector
-    if n_on_it == 0:
-        return NO_PLANE
-    few, most = n_on_it // 10, (9 * n_on_it) // 10
-    lift = ranked(near[:n_near], n_near // 2) if n_near >= ENOUGH_NEAR else 0.0
+def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundPlane | None:
+    """Measure how well a plane is seen; None if no cell lies on it."""
+    height, sector, inverse = plane[0], cells.cell // N_RINGS, cells.inverse
+    d, is_first = distance(cells.x, cells.y, cells.z, plane), is_new(sector)
+    is_over = (d * inverse > CLEARLY_OFF) & (cells.z < 0.0) & is_first
+    # Floor at the foot of a wall lies alone.
+    is_off, lowest = np.abs(d * inverse) > 1.0, distance(cells.x, cells.y, cells.lowest_z, plane)
+    d, z = np.where(is_off, lowest, d), np.where(is_off, cells.lowest_z, cells.z)
+    is_on = np.abs(d * inverse) <= 1.0
+    n = int(np.count_nonzero(is_on))
+    if n == 0:
+        return None
+    d, z, r = d[is_on], z[is_on], cells.r[is_on]
+    few, most, near = n // 10, 9 * n // 10, d[r < NEAR]
+    drop = np.arctan2(-z, r)
+    lift = ranked(near, len(near) // 2) if len(near) >= ENOUGH_NEAR else 0.0
     return GroundPlane(
         height=height,
-        slope_x=slope_x,
-        slope_y=slope_y,
+        slope_x=plane[1],
+        slope_y=plane[2],
         near_height=height - lift,
-        support=n_on_it / n,
-        near_support=weight / whole,
-        coverage=n_covered / N_SECTORS,
-        reach=ranked(ranges[:n_on_it], most),
-        depression=ranked(angles[:n_on_it], most),
-        spread=ranked(drops[:n_on_it], most) - ranked(drops[:n_on_it], few),
-        overhung=n_overhung / n_seen,
-        n_support=n_on_it,
+        support=n / len(cells.z),
+        near_support=cells.weight[is_on].sum() / cells.weight.sum(),
+        coverage=np.count_nonzero(is_new(sector[is_on])) / N_SECTORS,
+        reach=ranked(r, most),
+        depression=ranked(np.arctan2(height - d, r), most),
+        spread=ranked(drop, most) - ranked(drop, few),
+        overhung=np.count_nonzero(is_over) / np.count_nonzero(is_first),
+        n_support=n,
         other_height=other_height,
     )
 
 
-def ranked(values: FloatArray, rank: int) -> float:
+def is_new(sector: IntArray) -> BoolArray:
+    """Which cells are the nearest of a sector: they come sector by sector, from near to far."""
+    result = np.ones(len(sector), dtype=np.bool_)
+    result[1:] = sector[1:] != sector[:-1]
+    return result
+
+
+def ranked(values: Values, rank: int) -> float:
     """Value at `rank` in sorted order."""
-    return float(np.sort(values)[rank])
+    return float(np.partition(values, rank)[rank])

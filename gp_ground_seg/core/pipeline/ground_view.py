@@ -10,22 +10,18 @@ import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Scan, as_index
 from gp_ground_seg.core.pipeline.ground_plane import FARTHEST, GroundPlane, tolerance_at
-from gp_ground_seg.core.pipeline.points import Direction, angles_of, rotation, turned_back
+from gp_ground_seg.core.pipeline.points import angles_of, rotation
 
 MIN_SUPPORT = 0.35
 """Share of the lowest points on the plane from which a scan determines the tilt."""
 MIN_NEAR_SUPPORT = 0.5
 """Share of their weight that does as well: on a dike most of them lie below it, far away."""
-MIN_CELLS = 12
-"""Points on the plane from which it is ground for sure."""
 MIN_CLEARANCE, MIN_SPREAD = 0.05, 0.06
 """Height of the sensor over the plane [m], and spread of the angles of depression of these points
 [rad], for the same: more than one beam."""
 MIN_DEPTH = 2.5
 """Points on it one behind the other (`GroundPlane.depth`) that do without both: the lowest beam on
 walls, or a scan of one beam, gives one or two, 2.3 in a corridor; ground gives three and more."""
-CONE_SPREAD = 0.025
-"""Spread [rad] below which what looks like a plane is one beam on walls."""
 FEW_CELLS = 45
 """Cells on the plane below which its height is doubtful. Whole scans that show the height have
 more; parts of a scan, up to 60 degrees wide, have fewer, or less than `MIN_COVERAGE` of the
@@ -34,6 +30,7 @@ MIN_COVERAGE = 0.25
 """Share of the sectors with ground in them from which a scan determines the tilt."""
 MIN_REACH = 5.0
 """Range that the ground must reach for the same [m]."""
+
 OVERHUNG = 0.75
 """`GroundPlane.overhung` from which a plane may be that of a reflected ceiling."""
 
@@ -45,10 +42,9 @@ STEEP = math.radians(25.0)
 tilted frame are not all ground."""
 GOOD_SUPPORT, TALL = 0.9, 6.0
 """Support below which a plane this far below z may well be a facade [m]."""
-SUPPORT_RATIO = 0.8
-"""Least support of a plane about another axis over that of the plane below z."""
 OTHER_MIN_SUPPORT, OTHER_MIN_REACH = 0.5, 10.0
-"""Support of it, and range that it reaches [m]: walls and ceilings of rooms seldom do."""
+"""Support of a plane about another axis, and range that it reaches [m]: walls and ceilings of
+rooms seldom do."""
 CLEAR = 0.3
 """Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
 seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
@@ -76,14 +72,10 @@ FAR_OFF, TINY, HUGE = 10.0, 0.5, 200.0
 of nearly all [m] below which a cloud is not in metres; of half of them, above which it is not, if
 the farthest are ten times as far as the nearest."""
 
-_QUARTER = math.pi / 2.0
 UPRIGHT, *OTHER_AXES = (
-    rotation(*angles)
-    for angles in (
-        (0.0, 0.0), (math.pi, 0.0), (_QUARTER, 0.0), (-_QUARTER, 0.0), (0.0, _QUARTER),
-        (0.0, -_QUARTER),
-    )
-)  # fmt: skip
+    rotation(0.5 * math.pi * roll, 0.5 * math.pi * pitch)
+    for roll, pitch in ((0, 0), (2, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
+)
 """Rotations (3, 3) that turn z up, and each of the five other axes."""
 
 
@@ -95,9 +87,10 @@ class View(NamedTuple):
     is_mirror: bool = False  # whether what is below it are mirror images
 
     @property
-    def up(self) -> Direction:
-        """Normal of the plane, in the frame levelled by the parameters."""
-        return turned_back(self.plane.normal, self.turn)
+    def up(self) -> FloatArray:
+        """Normal of the plane, (3,), in the frame levelled by the parameters."""
+        up: FloatArray = self.turn.T @ self.plane.normal
+        return up
 
     @property
     def levelled(self) -> FloatArray:
@@ -107,7 +100,7 @@ class View(NamedTuple):
     @property
     def is_steep(self) -> bool:
         """Whether the plane is clearly tilted against the frame that it was fitted in."""
-        return self.plane.normal[2] < math.cos(STEEP)
+        return bool(self.plane.normal[2] < math.cos(STEEP))
 
     @property
     def is_well_supported(self) -> bool:
@@ -126,10 +119,8 @@ class View(NamedTuple):
         """Whether it is ground for sure: seen at several angles, or several rows deep."""
         plane = self.plane
         is_wide = plane.support >= MIN_SUPPORT and plane.coverage >= MIN_COVERAGE
-        return plane.n_support >= MIN_CELLS and (
-            (plane.height >= MIN_CLEARANCE and plane.spread >= MIN_SPREAD)
-            or (is_wide and plane.depth >= MIN_DEPTH)
-        )
+        is_spread = plane.height >= MIN_CLEARANCE and plane.spread >= MIN_SPREAD
+        return is_spread or (is_wide and plane.depth >= MIN_DEPTH)
 
     @property
     def is_whole(self) -> bool:
@@ -139,10 +130,8 @@ class View(NamedTuple):
 
     @property
     def tells_height(self) -> bool:
-        """Whether it may be ground: for sure, or seen at more than one angle, or over another."""
-        plane = self.plane
-        is_seen = plane.spread >= CONE_SPREAD or math.isfinite(plane.other_height)
-        return self.is_surface or (is_seen and plane.height >= MIN_CLEARANCE)
+        """Whether it may be ground: for sure, or below the sensor."""
+        return self.is_surface or self.plane.height >= MIN_CLEARANCE
 
     @property
     def tells_tilt(self) -> bool:
@@ -171,16 +160,16 @@ def is_doubtful(below: View | None) -> bool:
     return below.plane.height > TALL and below.plane.support < GOOD_SUPPORT
 
 
-def clearest(below: View | None, others: Iterable[View]) -> View | None:
+def clearest(below: View | None, others: Iterable[View | None]) -> View | None:
     """Return the one of `others` that clearly is the ground, if `below`, about z, is not."""
-    support = SUPPORT_RATIO * below.plane.support if below is not None else 0.0
     found = [
         view
         for view in others
-        if view.tells_tilt
+        if view is not None
+        and view.tells_tilt
         # No ground is above the sensor: roofs of cars, of whose ground little is seen, are.
         and -MIN_CLEARANCE <= view.plane.height <= TALL
-        and view.plane.support >= max(support, OTHER_MIN_SUPPORT)
+        and view.plane.support >= OTHER_MIN_SUPPORT
         and view.plane.reach >= OTHER_MIN_REACH
     ]
     return max(found, key=lambda view: view.plane.support, default=below)

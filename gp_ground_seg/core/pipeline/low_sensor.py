@@ -16,9 +16,6 @@ LOWEST = 0.1
 """Height below which the origin of a cloud is no sensor [m]."""
 LEAST_TOLERANCE = 0.04
 """Least tolerance of ground that a low sensor leads to [m]: twice the noise of its ranges."""
-MIN_DEPRESSION = 0.105
-"""Angle to the plane of the ground at which a low sensor sees the nearest of it, at least [rad].
-From the origin of a vehicle, at its axles, a sensor on the roof seems to see it at less."""
 
 
 def for_sensor(config: Config, pose: SensorPose) -> Config:
@@ -43,13 +40,5 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
 
 def sensor_height_of(pose: SensorPose) -> float:
     """Height of a low sensor over the ground, `REFERENCE_HEIGHT` of others [m]."""
-    is_there = is_seen_from_sensor(pose) and pose.sensor_height >= LOWEST
+    is_there = pose.starts_rays and pose.sensor_height >= LOWEST
     return min(pose.sensor_height, REFERENCE_HEIGHT) if is_there else REFERENCE_HEIGHT
-
-
-def is_seen_from_sensor(pose: SensorPose) -> bool:
-    """Whether the ground is seen at an angle at which a sensor over it sees the nearest of it.
-
-    Else the sensor is not where it is taken to be.
-    """
-    return pose.measured is not None and pose.measured.plane.depression >= MIN_DEPRESSION

@@ -14,15 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import (
-    Candidates,
-    FloatArray,
-    IntArray,
-    PointArray,
-    Scan,
-)
+from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray, PointArray, Scan
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane, tolerance_at
-from gp_ground_seg.core.pipeline.low_sensor import is_seen_from_sensor
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
 DEEP, DEEPEST = 0.15, 10.0
@@ -51,11 +44,6 @@ class MirrorImages(NamedTuple):
     points: IntArray  # (I,) indices
     rise: FloatArray  # (I,) [m]
 
-    @classmethod
-    def none(cls) -> MirrorImages:
-        """No return is one."""
-        return cls(np.zeros(0, dtype=np.int64), np.zeros(0))
-
     def raised(self, xyz: PointArray) -> PointArray:
         """Points (N, 3), each image where what it is an image of is."""
         result: PointArray = xyz.copy('K')
@@ -71,6 +59,9 @@ class MirrorImages(NamedTuple):
         return scan._replace(candidates=candidates.where(~is_image))
 
 
+NO_IMAGES = MirrorImages(np.zeros(0, dtype=np.int64), np.zeros(0))
+
+
 def find_mirror_images(scan: Scan, pose: SensorPose) -> MirrorImages:
     """Find the mirror images of a scan in the level frame: none unless the road is wet.
 
@@ -78,9 +69,9 @@ def find_mirror_images(scan: Scan, pose: SensorPose) -> MirrorImages:
     nearer. Where rays start must be known, or nothing is told.
     """
     grid, plane_z = scan.grid, -pose.sensor_height
-    is_known = is_seen_from_sensor(pose) and plane_z < 0.0
+    is_known = pose.starts_rays and plane_z < 0.0
     if not is_known or mirror_share(GroundPlane(pose.sensor_height), scan) < MIRRORED:
-        return MirrorImages.none()
+        return NO_IMAGES
     inside = np.flatnonzero(grid.inside)
     r, z = grid.r[inside].astype(np.float64), scan.xyz[inside, 2].astype(np.float64)
     slope, cell = slope_of_sight(r, z), grid.cell[inside].astype(np.int64)
@@ -109,7 +100,7 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     if len(deep) <= WET_SHARE * np.count_nonzero(is_on_it):
         return 0.0
     place = np.column_stack([candidates.x[deep], candidates.y[deep], candidates.z[deep]])
-    normal, tile = np.array(plane.normal), candidates.tile[deep]
+    normal, tile = plane.normal, candidates.tile[deep]
     raised = place - (2.0 * over[deep] * normal[2])[:, None] * normal
     # A valley has little above it that is as high: no need to look closer.
     if np.mean(scan.tiles.extremes[tile, 1] > raised[:, 2] - COUNTERPART) < MIRRORED:

@@ -13,7 +13,6 @@ from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, PointArray
 
 Direction = tuple[float, float, float]
-Place = Direction
 
 COMPUTED = (np.dtype(np.float32), np.dtype(np.float64))
 """Types that are computed with."""
@@ -37,7 +36,7 @@ _MOST_ROWS, _LEAST_COLUMNS = 8, 65  # of an array that is taken for a transposed
 _Float = TypeVar('_Float', np.float32, np.float64)
 
 
-def take_points(points: npt.ArrayLike, origin: Place | None = None) -> PointArray:
+def take_points(points: npt.ArrayLike, origin: Direction | None = None) -> PointArray:
     """Return x, y, z, as they lie in memory if their type is one that is computed with.
 
     Of `points` (N, >=3) columns after the third are ignored. The result (N, 3) shares memory with
@@ -76,7 +75,7 @@ def take_points(points: npt.ArrayLike, origin: Place | None = None) -> PointArra
     return xyz
 
 
-def leave_out_empty_rays(xyz: PointArray, origin: Place, written: np.dtype[Any]) -> None:
+def leave_out_empty_rays(xyz: PointArray, origin: Direction, written: np.dtype[Any]) -> None:
     """Set the points (N, 3) at the sensor to NaN.
 
     Drivers send rays without a return as (0, 0, 0), which a change of frame moves to the `origin`
@@ -93,7 +92,7 @@ def leave_out_empty_rays(xyz: PointArray, origin: Place, written: np.dtype[Any])
         xyz[indices] = np.nan
 
 
-def _points_at(place: Place, xyz: PointArray, rounding: float) -> IntArray:
+def _points_at(place: Direction, xyz: PointArray, rounding: float) -> IntArray:
     """Return the points (N, 3) that are at `place` but for `rounding`."""
     tolerance, x = rounding * max(map(abs, place)), xyz[:, 0]
     # Few points have this x, mostly none, and only those are looked at further.
@@ -106,7 +105,7 @@ def _points_at(place: Place, xyz: PointArray, rounding: float) -> IntArray:
     return near
 
 
-def _shared_places(xyz: PointArray) -> list[Place]:
+def _shared_places(xyz: PointArray) -> list[Direction]:
     """Return where sensors may be: what several of the points (N, 3) are."""
     if len(xyz) < _MANY:
         return []
@@ -162,7 +161,7 @@ def objection_to_ranges(xyz: PointArray) -> str:
 
 
 @np.errstate(invalid='ignore', over='ignore')
-def moved(xyz: PointArray, origin: Place) -> PointArray:
+def moved(xyz: PointArray, origin: Direction) -> PointArray:
     """Points (N, 3) about `origin`, in their own precision; `xyz` itself if that is theirs."""
     return (xyz - np.array(origin)).astype(xyz.dtype) if any(origin) else xyz
 
@@ -201,19 +200,9 @@ def rotation(roll: float, pitch: float) -> FloatArray:
 
     Sines and cosines of quarter turns are exact: axes swapped stay points swapped.
     """
-    (sr, cr), (sp, cp) = (_sine_cosine(angle) for angle in (roll, pitch))
+    parts = math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch)
+    sr, cr, sp, cp = (0.0 if abs(part) < 1e-12 else part for part in parts)
     return np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
-
-
-def _sine_cosine(angle: float) -> tuple[float, float]:
-    sine, cosine = math.sin(angle), math.cos(angle)
-    return (0.0 if abs(sine) < 1e-12 else sine), (0.0 if abs(cosine) < 1e-12 else cosine)
-
-
-def vertical(roll: float, pitch: float) -> Direction:
-    """Last row of `rotation`: the direction that is up, in the frame of the sensor."""
-    (sr, cr), (sp, cp) = _sine_cosine(roll), _sine_cosine(pitch)
-    return -sp, cp * sr, cp * cr
 
 
 def rotate(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
@@ -242,12 +231,6 @@ def angles_of(up: FloatArray | Direction) -> tuple[float, float]:
     across = math.hypot(up[1], up[2])
     roll = rounded(math.atan2(up[1], up[2])) if across > 1e-4 else 0.0
     return roll if roll > -rounded(math.pi) else -roll, rounded(math.atan2(-up[0], across))
-
-
-def turned_back(direction: Direction, matrix: FloatArray) -> Direction:
-    """Direction in the frame that the rotation `matrix` (3, 3) starts from."""
-    x, y, z = (matrix.T @ direction).tolist()
-    return x, y, z
 
 
 def rounded(value: float) -> float:

@@ -15,15 +15,7 @@ from gp_ground_seg.core.parameters.config import SensorConfig
 from gp_ground_seg.core.parameters.schema import AUTO
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.ground_view import View, refusal
-from gp_ground_seg.core.pipeline.points import (
-    Direction,
-    angles_of,
-    rotate,
-    rotation,
-    rounded,
-    turned_back,
-    vertical,
-)
+from gp_ground_seg.core.pipeline.points import Direction, angles_of, rotate, rotation, rounded
 
 DEFAULT_HEIGHT = 1.73
 """Height where `sensor.height` is auto and the scan does not determine it: a car's roof [m]."""
@@ -37,9 +29,6 @@ LOW_GROUND = (
     f'the ground seems to be less than {LOW:g} m below the sensor, and may be a table top: set '
     'sensor.height'
 )
-LEAST_DEPRESSION = 0.06
-"""Angle below the horizontal at which a sensor sees the nearest tenth of a plane that it is less
-than `LOW` above [rad]. The origin of a vehicle is as low, but sees no ground that near."""
 LITTLE_GROUND = (
     'the scan shows little ground near the sensor, and the height estimated from it may be wrong: '
     'set sensor.height'
@@ -114,7 +103,12 @@ class SensorPose:
     @property
     def sensor_height(self) -> float:
         """Height of the sensor above the ground near it, along the vertical [m]."""
-        return self.height + _product(vertical(self.roll, self.pitch), self.origin)
+        return self.height + float(self.rotation[2] @ self.origin)
+
+    @property
+    def starts_rays(self) -> bool:
+        """Whether the ground is seen as from a sensor at the origin that was taken."""
+        return self.measured is not None and self.measured.plane.is_below_sensor
 
     @property
     def is_well_seen(self) -> bool:
@@ -187,28 +181,22 @@ def estimate_pose(
     doubts = (objection,) if objection and sensor.height == AUTO else ()
     if view is None:
         return dataclasses.replace(given, contradictions=contradictions, doubts=doubts)
-    plane, tells_height, tells_tilt = view.plane, view.tells_height, view.tells_tilt
-    up = view.up if given.is_level else turned_back(view.up, given.rotation)
-    roll, pitch = _levelled(up, sensor)
-    levelled = vertical(roll, pitch)
-    corrects = tells_tilt and _angle(levelled, vertical(given.roll, given.pitch)) >= CLEAR_TILT
+    plane, tells_height = view.plane, view.tells_height
+    up = given.rotation.T @ view.up
+    pose = _levelled(given, up, sensor)
+    if not view.tells_tilt or pose.rotation[2] @ given.rotation[2] > math.cos(CLEAR_TILT):
+        pose = given
     # Along the vertical of the pose used, not across the plane.
-    along = _product(levelled, up) if corrects else view.up[2]
-    if not corrects:
-        roll, pitch = given.roll, given.pitch
-    height = plane.near_height * plane.normal[2] / along
-    height = rounded(height - _product(vertical(roll, pitch), given.origin))
+    vertical = pose.rotation[2]
+    height = plane.near_height * plane.normal[2] / (vertical @ up) - vertical @ pose.origin
+    height = rounded(float(height))
     other = height + plane.other_height - plane.near_height
-    measured = MeasuredPose(height, *angles_of(up), tells_height, tells_tilt, plane, other)
+    measured = MeasuredPose(height, *angles_of(up), tells_height, view.tells_tilt, plane, other)
     estimates_height = sensor.height == AUTO and tells_height
     return dataclasses.replace(
-        given,
+        pose,
         height=height if estimates_height else given.height,
-        roll=roll,
-        pitch=pitch,
         height_estimated=estimates_height,
-        roll_estimated=sensor.roll == AUTO and corrects,
-        pitch_estimated=sensor.pitch == AUTO and corrects,
         measured=measured,
         contradictions=contradictions or _contradictions(sensor, measured, view),
         is_height_default=sensor.height == AUTO and not tells_height,
@@ -238,26 +226,20 @@ def with_fallback(pose: SensorPose, fallback: SensorPose, sensor: SensorConfig) 
 def _doubts(view: View) -> tuple[str, ...]:
     """Say why the height of the plane of `view` may not be that of the ground."""
     plane = view.plane
-    is_low = plane.near_height * plane.normal[2] < LOW and plane.depression >= LEAST_DEPRESSION
+    is_low = plane.near_height * plane.normal[2] < LOW and plane.is_below_sensor
     # A boolean of numpy does not multiply a tuple.
     return (LOW_GROUND,) * bool(is_low) + (LITTLE_GROUND,) * (not view.is_whole)
 
 
-def _levelled(up: Direction, sensor: SensorConfig) -> tuple[float, float]:
-    """Roll and pitch [rad] that turn `up` upwards as far as those given allow."""
-    roll = rounded(math.atan2(up[1], up[2])) if sensor.roll == AUTO else sensor.roll
-    if sensor.pitch != AUTO:
-        return roll, sensor.pitch
+def _levelled(given: SensorPose, up: FloatArray, sensor: SensorConfig) -> SensorPose:
+    """Return `given` with angles that turn `up` upwards, as far as those given allow."""
+    frees_roll, frees_pitch = sensor.roll == AUTO, sensor.pitch == AUTO
+    roll = rounded(math.atan2(up[1], up[2])) if frees_roll else given.roll
     across = up[1] * math.sin(roll) + up[2] * math.cos(roll)
-    return roll, rounded(math.atan2(-up[0], across))
-
-
-def _product(a: Direction, b: Direction) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _angle(a: Direction, b: Direction) -> float:
-    return math.acos(min(max(_product(a, b), -1.0), 1.0))
+    pitch = rounded(math.atan2(-up[0], across)) if frees_pitch else given.pitch
+    return dataclasses.replace(
+        given, roll=roll, pitch=pitch, roll_estimated=frees_roll, pitch_estimated=frees_pitch
+    )
 
 
 def _contradictions(sensor: SensorConfig, measured: MeasuredPose, view: View) -> tuple[str, ...]:
@@ -272,7 +254,7 @@ def _contradictions(sensor: SensorConfig, measured: MeasuredPose, view: View) ->
                 f'sensor.height = {sensor.height:g}: the ground near the sensor is '
                 f"{abs(measured.height):.2f} m {side} the cloud's origin"
             )
-    if measured.tells_tilt and math.acos(min(view.up[2], 1.0)) > TILT_CONTRADICTION:
+    if measured.tells_tilt and view.up[2] < math.cos(TILT_CONTRADICTION):
         names = [n for n in ('roll', 'pitch') if getattr(sensor, n) != AUTO]
         if names:
             words = ', '.join(f'sensor.{name} = {getattr(sensor, name):g}' for name in names)
