@@ -3,6 +3,7 @@
 import argparse
 import io
 import logging
+import os
 import re
 import shlex
 import subprocess
@@ -151,6 +152,17 @@ def test_what_computes_nothing_imports_nothing_heavy(code, heavy):
     loaded = {name.split('.')[0] for name in done.stderr.split()}
     assert 'gp_ground_seg' in loaded
     assert not loaded & heavy
+
+
+@pytest.mark.parametrize('name', ['module://matplotlib_inline.backend_inline', 'ipympl', 'none'])
+def test_a_backend_of_a_notebook_is_not_asked_for(name):
+    """Importing matplotlib fails where MPLBACKEND is not installed."""
+    code = (
+        f'{ENTRY.format(["config", "dump"])}; import matplotlib; print(matplotlib.get_backend())'
+    )
+    env = {**os.environ, 'MPLBACKEND': name}
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, env=env)
+    assert done.stdout.endswith('\nagg\n'), done.stderr
 
 
 def test_what_the_library_logs_is_said_within_a_command_only(monkeypatch, capsys):
