@@ -369,18 +369,21 @@ class _Loader(yaml.BaseLoader):
         text = super().construct_scalar(node)
         if node.style in ('"', "'") or node.tag == 'tag:yaml.org,2002:str':
             return text
-        word = text.lower()
         if text in _SWITCHES:
             return _SWITCHES[text]
-        if _INTEGER.fullmatch(word):
-            base = 16 if 'x' in word else 8 if word.lstrip('+-')[0] == '0' else 10
-            if -(2**63) <= (number := int(word, base)) < 2**63:
+        if not text.isascii() or '_' in text:  # which Python has in numbers, and C has not
+            return text
+        word = text.lower().replace('.inf', 'inf').replace('.nan', 'nan')
+        is_octal = word.lstrip('+-').isdigit() and word.lstrip('+-')[0] == '0'
+        with contextlib.suppress(ValueError):
+            number = int(word, 16 if 'x' in word else 8 if is_octal else 10)
+            if -(2**63) <= number < 2**63:
                 return number
-        if not (found := _NUMBER.fullmatch(word)):
-            return text or None
-        value = (float.fromhex if 'x' in word else float)(''.join(found.groups()))
-        # What is beyond the largest number is a word to ROS.
-        return text if math.isinf(value) and 'n' not in word else value
+        with contextlib.suppress(ValueError, OverflowError):
+            value = float.fromhex(word) if 'x' in word else float(word)
+            if math.isfinite(value) or 'n' in word:
+                return value
+        return text or None
 
 
 _SWITCHES = {
@@ -388,12 +391,6 @@ _SWITCHES = {
     for word in ('y', 'yes', 'true', 'on', 'n', 'no', 'false', 'off')
     for form in (word, word.capitalize(), word.upper())
 }
-# As strtol and strtod of C; an infinity and NaN may have a point before them.
-_INTEGER = re.compile(r'[-+]?(0x[0-9a-f]{1,16}|0[0-7]{0,21}|[1-9][0-9]{0,18})')
-_NUMBER = re.compile(
-    r'([-+]?)(?:\.(?=[in]))?(inf(?:inity)?|nan|0x(?:[0-9a-f]+\.?[0-9a-f]*|\.[0-9a-f]+)'
-    r'(?:p[-+]?[0-9]+)?|(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[-+]?[0-9]+)?)'
-)
 
 
 def read_yaml(path: str | Path) -> object:
