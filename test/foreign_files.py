@@ -5,7 +5,9 @@ or topic and number of clouds, or the line that refuses it). The points are `XYZ
 clouds of them.
 """
 
+import contextlib
 import io
+import sqlite3
 import struct
 import zipfile
 
@@ -73,7 +75,19 @@ CASES |= {
     'nested.npy': (NESTED, r'no field x of one number per point; fields: p \(4,\)'),
     'flat.npy': (npy(np.arange(9.0)), r'array of shape \(9,\): must be \(N, 3\)'),
     'shape.npz': (npz(a=npy_header((10**9, 3)) + bytes(10**6)), r'cannot be read as \.npz \('),
-    'names.npz': (npz(a=npy(XYZ), b=npy(XYZ)), r'arrays a \(4, 3\), b \(4, 3\):'),
+    'names.npz': (
+        npz(a=npy(XYZ), b=npy(XYZ)),
+        r'arrays a \(4, 3\), b \(4, 3\):.*; call it points',
+    ),
+    'open3d.npz': (
+        npz(colors=npy(-XYZ), normals=npy(-XYZ), pose=npy(np.eye(4)[:3]), positions=npy(XYZ)),
+        'x y z colors normals',
+    ),
+    'more_rows.npz': (npz(a=npy(-XYZ[:3]), b=npy(XYZ), calib=npy(np.eye(9))), 'x y z'),
+    'colours.npz': (npz(colours=npy(XYZ)), r'must be x, y, z, or one \(N, 3\)'),
+    'image.npy': (npy(XYZ.reshape(2, 2, 3)), r'a table after \.reshape\(-1, 3\)'),
+    'one_row.npy': (npy(XYZ[None]), r'a table after \.reshape\(-1, 3\)'),
+    'image.npz': (npz(a=npy(np.zeros((8, 9, 4)))), r'a table after \.reshape\(-1, 4\)'),
 }
 
 
@@ -139,6 +153,10 @@ CASES |= {
     'no_fields.pcd': (pcd(FIELDS=None), 'no FIELDS line'),
     'none.pcd': (b'no header', 'no DATA line'),
     'commas.pcd': (pcd(body=4 * b'0,1,2\n'), 'a line of 1 words, its header says 3, separated by'),
+    'no_size.pcd': (pcd(data='binary', body=RAW, WIDTH='0', HEIGHT='0'), 'x y z'),
+    'no_width_given.pcd': (pcd(WIDTH='0'), 'x y z'),
+    'no_height_given.pcd': (pcd(HEIGHT='0'), 'x y z'),
+    'too_many_given.pcd': (pcd(WIDTH='0', HEIGHT='0', POINTS='5'), 'truncated?'),
     'sizes.pcd': (pcd(WIDTH='9'), '4 points, which is not width 9'),
     'many.pcd': (many(8000000), '8000000 points'),
     'packed.pcd': (
@@ -281,11 +299,29 @@ WIDE_FIELDS[3].count = 400_000_000
 WIDE = {'width': 0, 'data': np.zeros(0, np.uint8), 'row_step': 0, 'fields': WIDE_FIELDS}
 NO_BAG = 'cannot be read as a bag; '
 THREE = '/points 3'
+
+
+def message_of(value):
+    """Function that writes a bag whose messages have a value of another type of sqlite."""
+
+    def write(path):
+        samples.write_ros2_bag(path, 3)
+        with contextlib.closing(sqlite3.connect(path)) as bag:
+            bag.execute(f'UPDATE messages SET {value}')
+            bag.commit()
+
+    return write
+
+
 CASES |= {
     **{f'hello.{end}': (b'hello', NO_BAG) for end in ('mcap', 'bag', 'db3')},
     **{f'empty.{end}': (b'', NO_BAG) for end in ('mcap', 'bag', 'db3')},
     'points.mcap': (with_one(width=400_000_000), 'bytes: must be at least 8800000000'),
     'wide.db3': (with_one(**WIDE), '400000004 numbers per point'),
+    'whole.db3': (message_of('data = 1000000000'), f"{NO_BAG}.*not 'int'"),
+    'real.db3': (message_of('data = 1.5'), f"{NO_BAG}.*not 'float'"),
+    'text.db3': (message_of("data = 'a'"), f"{NO_BAG}.*not 'str'"),
+    'time.db3': (message_of("timestamp = 'a'"), NO_BAG),
     'record.bag': (write_long_record, NO_BAG),
     'plain.mcap': (mcap(), THREE),
     'lz4.mcap': (mcap(compression=CompressionType.LZ4), THREE),

@@ -8,7 +8,14 @@ import sys
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import shown
 from gp_ground_seg.core.parameters.config import Config, find_preset, parameter_specs
-from gp_ground_seg.core.parameters.schema import NO_VALUES, read_parameters
+from gp_ground_seg.core.parameters.schema import (
+    FORM_OF_ROS,
+    NO_VALUES,
+    is_ours,
+    nodes_of,
+    read_yaml,
+)
+from gp_ground_seg.ros.arguments import objections_of_ros
 
 EXAMPLES = """\
   gp-ground-seg config dump > my.yaml            every parameter, explained, with its default
@@ -51,22 +58,21 @@ def run_check(arguments: argparse.Namespace) -> int:
     """Print the problems of each file, or how much it gives and changes."""
     code = 0
     for path in arguments.files:
-        if problems := Config.problems_of_file(path):
+        problems = Config.problems_of_file(path)
+        nodes = [] if problems else nodes_of(read_yaml(path))
+        if any(node for node, _ in nodes):
+            problems = objections_of_ros(path)
+        for problem in problems:
             code = 2
-            lines = (shown(f'{path}: {problem}') for problem in problems)
-            print(*lines, sep='\n', file=sys.stderr)
-            continue
-        file = read_parameters(path)
-        if not file.values:
-            options.note(f'{path}: {NO_VALUES}')
-        n_changed = len(Config().differences(Config().replace(**file.values)))
-        given = f'{len(file.values)} of {len(parameter_specs())} parameters given'
-        use = ''
-        if not file.node:
-            use = ' for --config, but not for the node, which needs the form of ROS: '
-            use += 'gp-ground-seg config dump --config FILE > ros.yaml'
-        elif not file.is_ours:
-            use = f' for a node named {shown(file.node)} only'
-        differ = 'differs' if n_changed == 1 else 'differ'
-        print(f'{shown(path)}: good{use}; {given}, {n_changed} {differ} from the defaults')
+            print(shown(f'{path}: {problem}'), file=sys.stderr)
+        for node, values in [] if problems else nodes:
+            if not values:
+                options.note(f'{path}: {NO_VALUES}')
+            n_changed = len(Config().differences(Config().replace(**values)))
+            given = f'{len(values)} of {len(parameter_specs())} parameters given'
+            use = '' if node else f' for --config, but not in the form of ROS that {FORM_OF_ROS}'
+            if '/' in node.strip('/') or not is_ours(node):
+                use = f' for a node named {shown(node)} only'
+            differ = 'differs' if n_changed == 1 else 'differ'
+            print(f'{shown(path)}: good{use}; {given}, {n_changed} {differ} from the defaults')
     return code

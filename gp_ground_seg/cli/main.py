@@ -154,6 +154,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     It is that of the command, 2 after an error, which takes one line, or 130 when interrupted.
     """
+    os.environ['MPLBACKEND'] = 'agg'  # that of a notebook need not be here; no window is opened
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors='backslashreplace')  # names of files need not be UTF-8
     try:

@@ -61,8 +61,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             picture,
             ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
             ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'}),
-            ('--frame', 'which of several, from 0 (default: %(default)s)',
-             {'metavar': 'N', 'type': int, 'default': 0}),
+            ('--frame', 'which of several, from 0 (default: 0)', {'metavar': 'N', 'type': int}),
             ('-o --output', f'{ENDINGS} file', {'metavar': 'OUT', 'required': True}),
             *options.CLOUDS,
             options.FORCE,
@@ -78,7 +77,11 @@ def run(arguments: argparse.Namespace) -> int:
     if path.suffix.lower() not in KINDS:
         raise DataError(f'{path}: must end in {ENDINGS}')
     check_writable(path, force=arguments.force)
-    scan = options.list_clouds(arguments)[arguments.frame]
+    scans = options.list_clouds(arguments)
+    scan = scans[arguments.frame or 0]
+    if arguments.frame is None and len(scans) > 1:
+        others = ''.join(f', {one.title}' for one in scans.files[1:4])
+        options.note(f'the first of {len(scans)} clouds, {scan.title}{others} ...: see --frame')
     points, title, truth = scan.read().xyz, shown(scan.title), None
     if arguments.labels is not None:
         truth = true_labels(read_labels(arguments.labels, len(points)))

@@ -154,7 +154,7 @@ def _open_ros(path: Path, storage: str, stack: ExitStack) -> _Contents:
     def read(topics: Collection[str]) -> _Messages:
         for c, time, raw in bag.messages([c for c in readable if c.topic in topics]):
             cdr = jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2) if is_ros1 else raw
-            yield c.topic, time, bytes(cdr)
+            yield c.topic, int(time), bytes(memoryview(cdr))  # of a number, bytes are zeros
 
     return channels, read
 

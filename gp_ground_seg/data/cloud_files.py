@@ -8,6 +8,7 @@ and numbers still give labels: whether they can be those of a scan is checked fi
 from __future__ import annotations
 
 import io
+import re
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError, PointCloudError
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.core.pipeline.points import finite_points, objection_to_ranges
+from gp_ground_seg.core.pipeline.points import finite_points, objection_to_ranges, reshape_hint
 from gp_ground_seg.data.clouds import (
     Cloud,
     Columns,
@@ -45,15 +46,17 @@ _OTHER_COLUMNS = range(MIN_COLUMNS, 9)  # that are tried
 
 _MIN_POINTS = 100  # fewer are not judged
 _N_JUDGED = 10_000  # points of a larger scan that are judged
-_N_DISTANCES = 2_000  # between successive points, of a larger scan
 _SMALLEST = 1e-6  # coordinate that can be measured [m]
 _MAX_UNMEASURABLE = 0.4  # share of them; z may be zero in a whole scan
-# Three quarters of the points of the other number are that much nearer to the next one than the
-# median of the given number. Beams that fire in turns are far from each other, and every second
-# point of them is near to the next: multiples of the given number are not compared.
-_MUCH_NEARER = 4.0
+# What a number is says something about its column if the columns are right, and otherwise less:
+# z is low, an intensity positive. Points need not be in any order for that.
+_PERIOD = 840  # a multiple of all `_OTHER_COLUMNS`
+_N_PERIODS = 100  # of a larger file that are judged
+_N_CLASSES = 16  # of equally many numbers
+_MUCH_MORE, _CHANCE = 1.25, 0.05  # times as much, and by so much [nat]
 _TRANSPOSED = 20  # columns from which on a table of three or four rows is
-TABLE = 'points'  # array of an .npz that is a table (N, >= 3), beside fields (N,)
+TABLE = 'points'  # array of an .npz that is a table (N, >= 3), beside fields (N, ...)
+_BESIDE = re.compile('colo|rgb|normal|label|feat|flow|pose|transform|calib', re.IGNORECASE)
 
 
 def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
@@ -64,11 +67,7 @@ def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
     found = np.load(io.BytesIO(data), allow_pickle=False)
     arrays: Columns = {TABLE: found} if isinstance(found, np.ndarray) else dict(found)
     if coordinate_names(arrays)[0] not in arrays:
-        tables = [name for name, v in arrays.items() if v.dtype.names or v.shape[1:] >= (3,)]
-        if TABLE not in arrays and len(tables) != 1:
-            found = f'arrays {_shapes(arrays)}'
-            raise PointCloudError(f'{found}: must be x, y, z, or one array (N, 3) or wider')
-        table = arrays.pop(TABLE if TABLE in arrays else tables[0])
+        table = arrays.pop(_table_of(arrays))
         arrays = {**scatter(_points_of(table)), **arrays}
     x = arrays.get(coordinate_names(arrays)[0], np.empty(()))
     fields = {name: v for name, v in arrays.items() if x.ndim and v.shape[:1] == x.shape}
@@ -77,12 +76,30 @@ def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
     return gather(fields), {name: v for name, v in arrays.items() if name not in fields}
 
 
+def _table_of(arrays: Columns) -> str:
+    """Name of the table of coordinates: of most rows, and not called as something else."""
+    if TABLE in arrays:
+        return TABLE
+    tables = {
+        name: len(v)
+        for name, v in arrays.items()
+        if v.dtype.names or (v.ndim > 1 and v.shape[-1] >= 3 and not _BESIDE.search(name))
+    }
+    most = [name for name, n_rows in tables.items() if n_rows == max(tables.values())]
+    if len(most) != 1:
+        raise PointCloudError(
+            f'arrays {_shapes(arrays)}: must be x, y, z, or one (N, 3) or wider; call it {TABLE}'
+        )
+    return most[0]
+
+
 def _points_of(table: npt.NDArray[Any]) -> Fields:
     """Structured array of a table, or of one that is structured."""
     if table.dtype.names:
         return table.ravel()
     if table.ndim != 2 or table.shape[1] < 3:
-        raise PointCloudError(f'array of shape {table.shape}: must be (N, 3) or wider')
+        hint = reshape_hint(table.shape)
+        raise PointCloudError(f'array of shape {table.shape}: must be (N, 3) or wider{hint}')
     if table.shape[0] in (3, 4) and table.shape[1] >= _TRANSPOSED:
         raise PointCloudError(f'array of shape {table.shape}: is transposed; save its .T')
     return name_columns(table)
@@ -197,34 +214,38 @@ def read_scan(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[np.
     table = numbers.reshape(-1, columns)
     if better := find_columns(numbers, columns):
         raise DataError(
-            f'{path}: read with {columns} columns its successive points lie far apart, with '
-            f'{better} close together: use --columns {better}'
+            f'{path}: read with {columns} columns each is a mixture; the points have {better} '
+            f'numbers each: use --columns {better}'
         )
     check_scan(path, table)
     return table
 
 
 def find_columns(numbers: npt.NDArray[np.float32], columns: int) -> int:
-    """Return the number of columns with which successive points are much nearer; 0 if none."""
-    if len(numbers) < _MIN_POINTS * columns:
+    """Return the number of columns by which the numbers differ much more; 0 if there is none."""
+    if len(numbers) < 2 * _PERIOD:
         return 0
-    fitting = [n for n in _OTHER_COLUMNS if len(numbers) % n == 0 and columns % n and n % columns]
-    distances = {n: _distance(numbers, n, 0.75) for n in fitting}
-    best = min(distances, key=distances.__getitem__, default=0)
-    given = _distance(numbers, columns, 0.5)
-    if not best or _MUCH_NEARER * distances[best] >= given:
+    whole = numbers[: len(numbers) // _PERIOD * _PERIOD].reshape(-1, _PERIOD)
+    sample = np.nan_to_num(whole[:: 1 + len(whole) // _N_PERIODS]).ravel()
+    edges = np.unique(np.quantile(sample, np.linspace(0.0, 1.0, _N_CLASSES + 1)[1:-1]))
+    classes = np.searchsorted(edges, sample, side='right')
+    told = {n: _information(classes, n) for n in {*_OTHER_COLUMNS, columns}}
+    fitting = {n: told[n] for n in _OTHER_COLUMNS if len(numbers) % n == 0}
+    most = max(fitting.values(), default=0.0)
+    if most < _MUCH_MORE * told[columns] + _CHANCE:
         return 0
+    best = next(n for n in fitting if _MUCH_MORE * fitting[n] > most)  # not a multiple of it
     return 0 if find_objection(numbers.reshape(-1, best)[:, :3]) else best
 
 
-def _distance(numbers: npt.NDArray[np.float32], columns: int, share: float) -> float:
-    """Quantile `share` of the distances [m] of successive finite points; infinity without."""
-    xyz = numbers.reshape(-1, columns)[:, :3]
-    first = np.arange(0, len(xyz) - 1, 1 + len(xyz) // _N_DISTANCES)
-    with np.errstate(all='ignore'):
-        distance = np.linalg.norm(xyz[first + 1].astype(np.float64) - xyz[first], axis=1)
-    distance = distance[np.isfinite(distance)]
-    return float(np.quantile(distance, share)) if len(distance) else np.inf
+def _information(classes: npt.NDArray[np.intp], n: int) -> float:
+    """Mutual information [nat] of the column and the class of numbers in `n` columns."""
+    rows = classes[: len(classes) // n * n].reshape(-1, n)
+    counts = np.array([np.bincount(column, minlength=_N_CLASSES) for column in rows.T])
+    share = counts / counts.sum()
+    alone = np.outer(share.sum(axis=1), share.sum(axis=0))
+    seen = share > 0.0
+    return float((share[seen] * np.log(share[seen] / alone[seen])).sum())
 
 
 def four_columns(table: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:

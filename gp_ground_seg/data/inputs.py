@@ -141,7 +141,7 @@ def _find_files(source: Path) -> Sequence[Path]:
         return [source]
     for name in _SCAN_FOLDERS:
         folder = source / name
-        if files := sorted(filter(_is_scan, folder.glob('*'))):
+        if files := sorted(filter(_is_scan, folder.glob('*')), key=_in_order):
             return _without_output(files)
     raise DataError(f'{source}: no {accepted} file in it, and not a rosbag2 folder')
 
@@ -154,6 +154,12 @@ def _without_output(files: Sequence[Path]) -> Sequence[Path]:
     if n_left_out := len(files) - len(kept):
         LOGGER.info('output of earlier runs left out: %d of %d files', n_left_out, len(files))
     return kept
+
+
+def _in_order(path: Path) -> tuple[list[str | int], str]:
+    """Key of a file: numbers in its name count as numbers, so scan2 is before scan10."""
+    words = re.split('([0-9]+)', path.name)
+    return [int(word) if k % 2 else word for k, word in enumerate(words)], path.name
 
 
 def _stem(path: Path) -> str:

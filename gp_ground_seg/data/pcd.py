@@ -77,9 +77,10 @@ def _shape_of(entries: dict[str, list[str]]) -> tuple[int, int]:
     given = {key: _number(key, ' '.join(entries[key])) for key in _SHAPE if key in entries}
     if not {'WIDTH', 'POINTS'} & given.keys():
         raise PointCloudError('no WIDTH or POINTS line in its header')
-    height = given.get('HEIGHT', 1)
-    width = given['WIDTH'] if 'WIDTH' in given else given['POINTS'] // max(height, 1)
+    width, height = given.get('WIDTH', 0), given.get('HEIGHT', 1)
     n_points = given.get('POINTS', width * height)
+    if width * height == 0:  # some writers leave it to POINTS
+        return n_points, 1
     if n_points != width * height:
         raise PointCloudError(f'{n_points} points, which is not width {width} * height {height}')
     return width, height

@@ -7,17 +7,47 @@ import contextlib
 import itertools
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.core.errors import ConfigError, GroundSegError, shown
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.parameters.schema import ROS_PARAMETERS_KEY, read_yaml
+from gp_ground_seg.core.parameters.schema import (
+    EMPTY_LIST,
+    FORM_OF_ROS,
+    ROS_PARAMETERS_KEY,
+    read_yaml,
+    sections_of,
+)
 
-HIGHEST_DOMAIN = 232
+_HIGHEST = {
+    'ROS_DOMAIN_ID': 232,
+    'RCUTILS_COLORIZED_OUTPUT': 1,
+    'RCUTILS_LOGGING_BUFFERED_STREAM': 1,
+    'RCUTILS_LOGGING_USE_STDOUT': 1,
+}
+"""Whole numbers in the environment, with the highest of each."""
 LOG_FOLDER = 'set ROS_LOG_DIR to a folder that the node may write to'
-NO_VALUE = ': a value is null or an empty list, which ROS does not read; no input.crop_box is none'
+_NAMES = (
+    'must be OLD:=NEW, of topics such as /front/points: words of letters, digits and single _, '
+    'none begins with a digit, / between them and not at the end; NEW of __ns begins with /, that '
+    'of __node is one word'
+)
+_RULES = {
+    'remap rule': _NAMES,
+    'node namespace': _NAMES,
+    'parameter override rule': 'must be NAME:=VALUE, as in sensor.height:=1.2',
+    'severity level': 'must be debug, info, warn, error or fatal, or NAME:= one of them',
+    'Enclave name': 'as in /front/lidar',
+    'PARAMETER_NOT_SET': f'an empty list: {EMPTY_LIST}',
+    'failed to initialize logging': LOG_FOLDER,
+    'Failed opening file': LOG_FOLDER,
+}
+"""Rules of ROS in words, by a part of its lines, which name places in its code instead."""
 
 
 def initialize(words: Sequence[str], context: Any = None) -> None:
@@ -50,31 +80,57 @@ def start_errors() -> Iterator[None]:
         if isinstance(error, GroundSegError):
             raise
         # Without the places in the source code of rcl.
-        text = re.sub(r', at \S+\.c:\d+', '', ' '.join(str(error).split()))
+        text = re.sub(r', at \S+\.[chp]+:\d+', '', ' '.join(str(error).split()))
         kind = type(error).__name__
-        is_of_log = text.startswith(('failed to initialize logging', 'Failed opening file'))
-        text += f': {LOG_FOLDER}' if is_of_log else ''
-        text += NO_VALUE if 'PARAMETER_NOT_SET' in text else ''
+        rules = [rule for part, rule in _RULES.items() if part in text]
+        text = ': '.join([text, *rules[:1]])
         raise ConfigError(text if kind == 'RCLError' else f'{kind}: {text}') from error
 
 
 def _check_surroundings(words: Sequence[str]) -> None:
     """Raise a ConfigError for what rcl ignores silently, or ends the process for."""
-    domain = os.environ.get('ROS_DOMAIN_ID', '')
-    if domain.isdecimal() and int(domain) > HIGHEST_DOMAIN:
-        raise ConfigError(f'ROS_DOMAIN_ID = {domain}: must be an integer in [0, {HIGHEST_DOMAIN}]')
+    for name, most in _HIGHEST.items():
+        value = os.environ.get(name) or '0'
+        if not value.isdecimal() or int(value) > most:
+            raise ConfigError(f'{name} = {value}: must be an integer in [0, {most}]')
     if not any(os.environ.get(name) for name in ('ROS_LOG_DIR', 'ROS_HOME', 'HOME')):
         raise ConfigError(f'no folder for logs, as HOME is not set: {LOG_FOLDER}')
     for path in _parameter_files(words):
         try:
             document = read_yaml(path)
+            if document and not sections_of(document):
+                raise ConfigError(f'no {ROS_PARAMETERS_KEY}, which {FORM_OF_ROS}')
         except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error
-        if document and not _node_keys(document):
-            raise ConfigError(
-                f'{path}: no {ROS_PARAMETERS_KEY}, which the node needs; from bare groups: '
-                'gp-ground-seg config dump --config FILE > ros.yaml'
-            )
+
+
+def check_middleware() -> None:
+    """Raise a ConfigError where rcl would end this process when it is imported."""
+    name = os.environ.get('RMW_IMPLEMENTATION')
+    if not name:
+        return
+    command = [sys.executable, '-c', 'import rclpy._rclpy_pybind11']
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode and 'Traceback' not in done.stderr:
+        package = f'ros-jazzy-{name.replace("_", "-")}'
+        raise ConfigError(
+            f'RMW_IMPLEMENTATION = {name}: is not installed here: unset it, or install {package}'
+        )
+
+
+def objections_of_ros(path: str | Path) -> list[str]:
+    """Return why ROS's own parser refuses a parameter file; nothing where ROS is not installed."""
+    check_middleware()
+    try:
+        from rclpy.utilities import remove_ros_args
+
+        with start_errors():
+            remove_ros_args(['', '--ros-args', '--params-file', str(path)])
+    except ConfigError as error:
+        return [str(error).rpartition('Error: ')[2]]
+    except ImportError:
+        pass
+    return []
 
 
 def _parameter_files(words: Sequence[str]) -> list[str]:
@@ -84,8 +140,9 @@ def _parameter_files(words: Sequence[str]) -> list[str]:
 def with_file(problem: str, words: Sequence[str]) -> str:
     """Return a problem of the parameters, after the last of the files `words` that has it."""
     for path in reversed(_parameter_files(words)):
-        if problem in Config.problems_of_file(path):
-            return f'{path}: {problem}'
+        for found in Config.problems_of_file(path):
+            if found == problem or (EMPTY_LIST in found and EMPTY_LIST in problem):
+                return f'{path}: {found}'
     return problem
 
 
@@ -95,7 +152,7 @@ def unused_files(words: Sequence[str], node_name: str) -> list[str]:
     for path in _parameter_files(words):
         keys: list[str] = []
         with contextlib.suppress(ConfigError):  # it was read before, and may be gone
-            keys = _node_keys(read_yaml(path))
+            keys = [key for key, _ in sections_of(read_yaml(path))]
         if keys and not any(_is_of_node(key, node_name) for key in keys):
             lines.append(
                 f'{shown(path)}: not used: its parameters are those of '
@@ -110,14 +167,3 @@ def _is_of_node(key: str, node_name: str) -> bool:
     rooted = key if key.startswith('/') else f'/{key}'
     # rcl has accepted the key: apart from * it has letters, digits, _ and / only.
     return re.fullmatch(rooted.replace('/*', r'(/\w+)'), node_name) is not None
-
-
-def _node_keys(document: object, above: str = '') -> list[str]:
-    """Return the names, with nested namespaces, whose parameters a document has."""
-    if not isinstance(document, dict):
-        return []
-    found = [above] if ROS_PARAMETERS_KEY in document else []
-    for key, below in document.items():
-        if key != ROS_PARAMETERS_KEY:
-            found += _node_keys(below, f'{above}/{key}' if above else str(key))
-    return found

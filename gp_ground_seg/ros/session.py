@@ -23,7 +23,7 @@ from gp_ground_seg.core.errors import (
     MissingDependencyError,
     install_hint,
 )
-from gp_ground_seg.ros.arguments import initialize, start_errors
+from gp_ground_seg.ros.arguments import check_middleware, initialize, start_errors
 
 ROS_WHEELS = "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
 _STOPS = (signal.SIGINT, signal.SIGTERM)
@@ -38,6 +38,7 @@ MIN_SHARED_MEMORY = 128 << 20  # four segments of the profile [bytes]
 def needing_ros(command: str) -> Iterator[None]:
     """Turn a failed import of ROS within the block into a MissingDependencyError."""
     try:
+        check_middleware()
         yield
     except ImportError as error:
         if isinstance(error, GroundSegError) or (error.name or '').startswith('gp_ground_seg'):

@@ -87,6 +87,12 @@ FOLDERS = {
         ['a.npy', 'a_ground.npy', 'a_ground_obstacles.npy', 'b_ground.npy', 'c_surface.npy'],
         ['a', 'b_ground', 'c_surface'],
     ),
+    'numbers': (['a11.npy', 'a2.npy', 'a1.npy', 'a10.npy'], ['a1', 'a2', 'a10', 'a11']),
+    'two numbers': (
+        ['s2_f1.bin', 's10_f2.bin', 's2_f10.bin', 's2_f2.bin'],
+        ['s2_f1', 's2_f2', 's2_f10', 's10_f2'],
+    ),
+    'letters first': (['1b.ply', 'a1.ply', '1a.ply'], ['1a', '1b', 'a1']),
     'SemanticKITTI': (['velodyne/000007.bin', 'labels/000007.label'], ['000007']),
     'nuScenes': (['samples/LIDAR_TOP/a__LIDAR_TOP__1.pcd.bin'], ['a__LIDAR_TOP__1']),
     'sequences': (['sequences/00/velodyne/0.bin'], r'no \.bin, .* file in it, and not a rosbag2'),
@@ -124,6 +130,8 @@ def test_clouds_and_pictures_of_a_bag(tmp_path, capsys):
         capsys.readouterr()
         assert run('plot', 'scan', bag, '--frame', frame, '-o', tmp_path / f'{frame}.png') == code
     assert '--frame 3: must be 0 to 2 here' in error_line(capsys)
+    assert run('plot', 'segment', bag, '--segment', 9, '-o', tmp_path / 'a.png') == 0
+    assert 'note: the first of 3 clouds, drive.mcap[0] ...: see --frame' in capsys.readouterr().err
     assert len({(tmp_path / f'{frame}.png').read_bytes() for frame in range(3)}) == 3
 
 

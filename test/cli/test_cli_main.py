@@ -3,13 +3,17 @@
 import argparse
 import io
 import logging
+import os
 import re
 import shlex
 import subprocess
 import sys
 import time
+from pathlib import Path
 
+import numpy as np
 import pytest
+from bag_samples import scan
 from cli_runner import error_line
 
 from gp_ground_seg.cli import main as cli
@@ -25,30 +29,81 @@ def test_the_help_has_the_purpose_of_each_command(capsys):
     assert all(f'{name} {purpose}' in said for name, (_, purpose) in cli.COMMANDS.items())
 
 
-@pytest.mark.parametrize(
-    ('line', 'said'),
-    [
-        ('segmnt A', "COMMAND: invalid choice: 'segmnt' .choose from .*; see gp-"),
-        ('node -r a:=/x', 'unrecognized arguments: -r a:=/x; see gp-ground-seg --help'),
-        ('demo --ros-args -r a:=b', 'demo: --ros-args: this command takes none'),
-        ('plot segment A -o B --segment 1,', "--segment: invalid numbers value: '1,'"),
-        ('experiment scenes --scenes flt',
-         "--scenes: 'flt': must be some of .*, each once"),
-        ('segment A --workers x', "--workers: 'x': must be a whole number, at least 1; see "),
-        ('demo --frames 0', "--frames: '0': must be a whole number, at least 1"),
-        ('segment A --columns 2', "--columns: '2': must be a whole number, at least 3"),
-        ('play A --rate 0', "--rate: '0': must be a number, above 0"),
-        ('play A --rate nan', "--rate: 'nan': must be a number, above 0"),
-        ('segment A --preset papr',
-         r"unknown preset 'papr'; did you mean paper. \(there are default, paper\)"),
-        ('segment A --set a', '--set a: must be NAME=VALUE'),
-        ('segment s3://bucket/kitti -o out', 's3:/bucket/kitti: no such file or folder'),
-    ],
-)  # fmt: skip
-def test_wrong_words_are_one_line_with_the_next_step(line, said, capsys):
+XYZ = scan()[:-1, :3]
+FILES = {
+    'scan.npy': XYZ, 'image.npy': XYZ.reshape(30, 60, 3), 'turned.npy': XYZ.T, 'mm.npy': 1e3 * XYZ,
+    'map.npy': XYZ + np.array([448_250.5, 5_411_900.25, 312.0]),
+    'many/1.npy': XYZ, 'many/2.npy': XYZ, 'scan.txt': b'1 2 3', 'cut.bin': bytes(17),
+    'six.bin': np.hstack([XYZ, XYZ % 1]).astype('f4').tobytes(), 'taken.npy': b'', 'a.label': b'',
+    'none/a.las': b'', 'a.pcd': b'solid', 'text.mcap': b'hello',
+    'two.yaml': b'/a: {ros__parameters: {}}', 'typo.yaml': b'label: {ground_tolerence: 0.1}',
+    'tab.yaml': b'label:\n\tground_tolerance: 0.1', 'unit.yaml': b'sensor: {height: 1.7 m}',
+    'twice.yaml': b'sensor: {height: 1}\nsensor: {pitch: 0}', 'quoted.yaml': b'sensor.height: "1"',
+}  # fmt: skip
+MISTAKES = {
+    'segmnt A': "COMMAND: invalid choice: 'segmnt' .choose from .*; see gp-",
+    'segment': 'the following arguments are required: INPUT; see gp-ground-seg segment --help',
+    'segment nowhere.bin': 'nowhere.bin: no such file or folder',
+    'segment s3://bucket/kitti -o out': 's3:/bucket/kitti: no such file or folder',
+    'segment scan.txt': 'scan.txt: not a scan or bag; accepted are .*; of a text, save x, y, z as',
+    'segment none': r'none: no \.bin, .* file in it, and not a rosbag2 folder',
+    'segment cut.bin': 'cut.bin: 17 bytes is not a whole .*: truncated. --columns chooses another',
+    'segment six.bin': 'six.bin: read with 4 columns .*: use --columns 6',
+    'segment scan.npy --columns 3': '--columns: is for .bin scans, which scan.npy is not',
+    'segment A --columns 2': "--columns: '2': must be a whole number, at least 3",
+    'segment scan.npy -o taken.npy': 'taken.npy: exists already; --force replaces it',
+    'segment scan.npy -o no/a.npy': 'no/a.npy: the folder no does not exist',
+    'segment scan.npy -o a.las': r'a.las: must be a folder, or end in \.label, \.pcd',
+    'segment image.npy -o a.npy': r'image.npy: .* a table after \.reshape\(-1, 3\)',
+    'segment turned.npy -o a.npy': 'turned.npy: .* is transposed; save its .T',
+    'segment mm.npy -o a.npy': 'mm.npy: .* beyond 10 km, .*; scans are in metres about the sensor',
+    'segment map.npy -o a.npy': r'map.npy: .* beyond 10 km, .*xyz = points\[:, :3\] - \(X, Y, Z\)',
+    'segment a.pcd -o b.pcd': 'a.pcd: no DATA line of a header in it',
+    'segment text.mcap -o b.mcap': 'text.mcap: .*; if it is damaged, `mcap recover` saves the rea',
+    'segment many -o a.npy': 'a.npy: must be a folder',
+    'segment many scan.npy': 'many: is no bag, of several inputs each must be one',
+    'segment scan.npy --topic /a': '--topic: is for bags, which scan.npy is not',
+    'segment A --set a': '--set a: must be NAME=VALUE',
+    'segment A --set sensor.hight=1': "unknown .* 'sensor.hight'; did you mean sensor.height",
+    'segment A --set sensor=1': "'sensor' is a group of parameters: sensor.height, sensor.roll",
+    'segment A --set sensor.height=1,7': "sensor.height = '1,7': must be auto or a number in",
+    'segment A --set sensor.pitch=15': r'sensor.pitch = 15: must be auto .* in \[-1.58, 1.58\] r',
+    'segment A --preset papr': r"unknown preset 'papr'; did you mean paper. \(there are default",
+    'segment A --config no.yaml': 'no.yaml: No such file or directory',
+    'segment A --config two.yaml': r'two.yaml: parameters of node /a; must be of /\*\* or g',
+    'segment A --config typo.yaml': 'typo.yaml: unknown .*; did you mean label.ground_tolerance',
+    'segment A --config tab.yaml': r"tab.yaml: not valid YAML: .* '\\t' .* line 2",
+    'segment A --config unit.yaml': "unit.yaml: sensor.height = '1.7 m': must be auto or a number",
+    'segment A --config quoted.yaml': "quoted.yaml: sensor.height = '1': must be auto or a number",
+    'segment A --config twice.yaml': 'twice.yaml: sensor: given twice, line 2',
+    'segment A --workers x': "--workers: 'x': must be a whole number, at least 1; see ",
+    'config dmp': "WHAT: invalid choice: 'dmp' .choose from .dump., .check..; see gp-ground-seg c",
+    'plot scan scan.npy': 'the following arguments are required: -o/--output; see gp-ground-seg p',
+    'plot scan scan.npy -o a.gif': 'a.gif: must end in .png or .pdf or .svg',
+    'plot scan many -o a.png --frame 2': '--frame 2: must be 0 to 1 here',
+    'plot scan scan.npy -o a.png --labels a.label': 'a.label: 0 bytes, expected 7200 for 1800 poi',
+    'plot segment A -o B --segment 1,': "--segment: invalid numbers value: '1,'",
+    'evaluate many': 'many: no sequences/.*velodyne folder .*; scans without labels need --agai',
+    'experiment scenes --scenes flt': "--scenes: 'flt': must be some of .*, each once",
+    'play scan.npy': r'scan.npy: not a bag; accepted are ROS 1 \.bag, \.mcap, \.db3 and rosbag2',
+    'play A --rate 0': "--rate: '0': must be a number, above 0",
+    'play A --rate nan': "--rate: 'nan': must be a number, above 0",
+    'demo --frames 0': "--frames: '0': must be a whole number, at least 1",
+    'demo --ros-args -r a:=b': 'demo: --ros-args: this command takes none',
+    'node -r a:=/x': 'unrecognized arguments: -r a:=/x; see gp-ground-seg --help',
+}
+
+
+@pytest.mark.parametrize('line', MISTAKES)
+def test_mistakes_are_one_line_with_the_next_step(line, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name, content in FILES.items():
+        if name in line or name.split('/')[0] in line.split():
+            Path(name).parent.mkdir(exist_ok=True)
+            write = Path.write_bytes if isinstance(content, bytes) else np.save
+            write(Path(name), content)
     assert cli.main(line.split()) == 2
-    line = error_line(capsys)
-    assert re.match(said, line), line
+    assert re.match(MISTAKES[line], said := error_line(capsys)), said
 
 
 def parsers_below(parser):
@@ -97,6 +152,17 @@ def test_what_computes_nothing_imports_nothing_heavy(code, heavy):
     loaded = {name.split('.')[0] for name in done.stderr.split()}
     assert 'gp_ground_seg' in loaded
     assert not loaded & heavy
+
+
+@pytest.mark.parametrize('name', ['module://matplotlib_inline.backend_inline', 'ipympl', 'none'])
+def test_a_backend_of_a_notebook_is_not_asked_for(name):
+    """Importing matplotlib fails where MPLBACKEND is not installed."""
+    code = (
+        f'{ENTRY.format(["config", "dump"])}; import matplotlib; print(matplotlib.get_backend())'
+    )
+    env = {**os.environ, 'MPLBACKEND': name}
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, env=env)
+    assert done.stdout.endswith('\nagg\n'), done.stderr
 
 
 def test_what_the_library_logs_is_said_within_a_command_only(monkeypatch, capsys):

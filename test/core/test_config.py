@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from gp_ground_seg import Config, ConfigError
 from gp_ground_seg.cli.options import parse_setting
-from gp_ground_seg.core.parameters.config import find_spec, parameter_specs
+from gp_ground_seg.core.parameters.config import config_of, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.schema import numbers_of
 
 SPECS = parameter_specs()
@@ -123,11 +123,36 @@ def test_what_is_refused_and_what_is_said(changes, said):
         assert find_spec(WORD).check(good) == good
 
 
+NESTED = {'sensor': {'height': 1.5}, 'grid': {'n_bins': 90, 'r_max': 40}}
+IN_GROUPS = [
+    lambda groups: Config(**groups),
+    lambda groups: Config().replace(**groups),
+    config_of,
+    lambda groups: config_of({'/**': {'ros__parameters': groups}}),
+]
+
+
+@pytest.mark.parametrize('make', IN_GROUPS)
+def test_groups_may_be_mappings_as_in_a_file(make):
+    flat = {'sensor.height': 1.5, 'grid.n_bins': 90, 'grid.r_max': 40.0}
+    assert make(NESTED) == Config().replace(**flat)
+    assert make({'sensor': {}}) == Config()
+    for wrong, said in (
+        ({'sensor': {'hight': 1.5}}, 'did you mean sensor.height?'),
+        ({'sensor': {'height': 'high'}}, "sensor.height = 'high': must be auto or a number"),
+        ({'sensor': 1.5}, 'sensor'),
+    ):
+        with pytest.raises(ConfigError, match=re.escape(said)):
+            make(wrong)
+
+
 def test_groups_given_whole_are_checked_and_converted():
     label = dataclasses.replace(Config().label, ground_tolerance=1)
     assert type(Config(label=label).label.ground_tolerance) is float
     with pytest.raises(ConfigError, match=r'label\.ground_tolerance'):
         Config(label=dataclasses.replace(label, ground_tolerance='wide'))
+    with pytest.raises(ConfigError, match=r'^sensor = LabelConfig.*: must be a mapping'):
+        Config(sensor=label)
 
 
 @settings(max_examples=15)
@@ -169,7 +194,16 @@ READ = [
     *((empty, {}) for empty in ('', '# nothing\n', '{}', f'{IN_ROS} {{}}\n')),
     *(
         (f'observation: {{slope_std: {number}}}', {'observation.slope_std': 0.1})
-        for number in ('1e-1', '1E-1', '.1', '.1e0', '1.0e-1', '10e-2', '+0.1')
+        for number in ('1e-1', '1E-1', '.1', '.1e0', '10e-2', '+0.1', '0x1.999999999999ap-4')
+    ),
+    *((f'grid.n_bins: {number}', {'grid.n_bins': 64}) for number in ('0x40', '0100', '+64')),
+    *((f'surface.look_aside: {word}', {'surface.look_aside': False}) for word in ('n', 'Off')),
+    *((f'frame.base: {word}', {'frame.base': word}) for word in ('2026-11-28', '1_80', 'nul')),
+    (f'front:\n  ground_segmentation_node: {{ros__parameters: {{{GIVEN}}}}}', CHANGED),
+    (
+        f'{IN_ROS} {{sensor.height: 1.0}}\nother: {{ros__parameters: {{a: [1, 2]}}}}\n'
+        f'front:\n  ground_segmentation_node: {{ros__parameters: {{{GIVEN}}}}}',
+        CHANGED,
     ),
 ]
 VERDICTS = [
@@ -178,10 +212,19 @@ VERDICTS = [
     ('label: {ground_tolerance: "0.1"}', "label.ground_tolerance = '0.1': must be a number"),
     ('label: {ground_tolerance: 99.0}', 'must be a number in [0.001, 5] m'),
     ('grid: {n_segments: 90.0}', 'must be an integer in [4, 2048]'),
-    ('grid: {n_bins: ' + '1' * 100_000 + '}', 'line 1: a number of 100000 digits'),
-    ('grid: {n_bins: 0x' + 'f' * 200_000 + '}', 'line 1: a number of 200002 digits'),
-    ('grid: {n_bins: !!int x}', 'not valid YAML: invalid literal'),
-    ('grid: {n_bins: 2011-02-03}', 'grid.n_bins = datetime.date(2011, 2, 3): must be an int'),
+    *(
+        ('grid: {n_bins: ' + digits + '}', ': must be an integer in [4, 1024]')
+        for digits in ('1' * 100_000, '0x' + 'f' * 200)
+    ),
+    *(
+        (f'grid.n_bins: {word}', f"grid.n_bins = '{word}': must be an integer")
+        for word in ('1_80', '1:20', '0b1000000', '0o100', '2011-02-03', 'x')
+    ),
+    (f'{IN_ROS} {{input.crop_box: [-1, 0.3, -0.4, 0.4, -1, 0.2]}}', 'for ROS: write -1.0'),
+    (f'{IN_ROS} {{input.crop_box: [0.0, 3, true]}}', 'input.crop_box = [0.0, 3, True]: must ha'),
+    (f'{IN_ROS} {{input.crop_box: [[0.0, 3.0]]}}', '[[0.0, 3.0]]: must have one type for ROS'),
+    (f'{IN_ROS} {{input.crop_box: []}}', 'input.crop_box = []: ROS does not read an empty'),
+    (f'{IN_ROS} {{use_sim_time: 1}}', 'use_sim_time = 1: must be true or false'),
     ('grid: ' + '[' * 3000, 'not valid YAML: maximum recursion depth'),
     ('\n'.join(f'a{k}: 1' for k in range(2000)), 'more than 500 values'),
     ('/**: {ros__parameters: {}, a: 1}', 'values beside ros__parameters, which ROS refuses'),
@@ -194,9 +237,9 @@ VERDICTS = [
     ('label: {ground_tolerance: 0.1}\nlabel.ground_tolerance: 0.1', 'given twice'),
     ('- label', 'must be a mapping'),
     ('a: [', 'not valid YAML'),
-    ('label: {ground_tolerance: 2011-99-99}', 'not valid YAML'),
+    ('? [a]\n: 1', 'not valid YAML'),
     ('/**: {label: {ground_tolerance: 0.1}}', 'ros__parameters'),
-    ('/a: {ros__parameters: {}}\n/b: {ros__parameters: {}}\n', 'parameters of 2 nodes'),
+    ('/a: {ros__parameters: {}}\n/b: {ros__parameters: {}}\n', 'parameters of node /a, /b; mus'),
     ('/**: {ros__parameters: {use_sim_tme: true}}', 'unknown parameter'),
     ('/other: {ros__parameters: {}}', 'parameters of node /other; must be of /** or'),
     (b'\xff\xfe\x00', 'not a text file'),

@@ -90,7 +90,7 @@ def test_check_says_everything_that_is_wrong_at_once(tmp_path, capsys):
     assert 'grid.r_min = 20: must be below grid.r_max = 10' in found
 
 
-FOR_COMMANDS = 'good for --config, but not for the node, which needs the form of ROS: '
+FOR_COMMANDS = 'good for --config, but not in the form of ROS that the node needs; from bare gr'
 
 
 @pytest.mark.parametrize(

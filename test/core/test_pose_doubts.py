@@ -259,7 +259,8 @@ def test_lower_ends_of_objects_are_no_ground(scene, sensor):
     ('scale', 'move', 'said'),
     [(1.0, (60.0, 20.0, 0.0), 'the origin of the cloud is not the sensor'),
      (1.0, (700.0, 0.0, 30.0), 'the origin of the cloud is not the sensor'),
-     (120.0, (0.0, 0.0, 0.0), 'the cloud is not in metres'),
+     (1.0, (0.0, 230.0, 0.0), 'the origin of the cloud is not the sensor'),
+     *((scale, (0.0, 0.0, 0.0), 'the cloud is not in metres') for scale in (100.0, 120.0)),
      (0.001, (0.0, 0.0, 0.0), 'the cloud is not in metres')],
 )  # fmt: skip
 def test_a_cloud_in_another_frame_or_unit_is_named_and_its_origin_centres_it(scale, move, said):

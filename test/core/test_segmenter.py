@@ -109,8 +109,10 @@ TWO = (np.nan, 0), (0,), (0, 0, 0), (0.1, 'auto'), 0.1
 FRAMES = 1.0, (np.eye(3),), (np.eye(2), np.zeros(3)), (np.eye(3), [0.0, 0.0, np.nan])
 TEN = np.ones((10, 3))
 REFUSED = [
-    *((np.zeros(shape), {}, re.escape(str(shape))) for shape in ((3,), (5, 2), (2, 5, 3))),
-    *((TEN.astype(dtype), {}, rf'\(10, 3\).*{dtype}') for dtype in ('int32', 'complex128', '<U3')),
+    *((np.zeros(shape), {}, re.escape(f'{shape}')) for shape in ((3,), (5, 2))),
+    *((np.zeros((2, 5, n)), {}, rf'table after \.reshape\(-1, {n}\)$') for n in (3, 4)),
+    *((TEN.astype(dtype), {}, rf'\(10, 3\).*{dtype}') for dtype in ('bool', 'complex128', '<U3')),
+    *((TEN.astype(dtype), {}, r'; pass points\.astype\(float\)$') for dtype in ('i4', 'u1', 'i8')),
     (np.ma.masked_greater(TEN, 20.0), {}, r'masked array: pass points\.filled'),
     (np.zeros((8, 65)), {}, r'\(8, 65\): a point is a row; pass points\.T'),
     *((TEN, {'origin': v}, r'\Aorigin = .*: must be 3 finite numbers\Z') for v in THREE),

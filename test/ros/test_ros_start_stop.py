@@ -8,12 +8,14 @@ import sys
 
 import cli_runner
 import pytest
+import rclpy
 import ros_helpers as ros
 from bag_samples import write_ros2_bag
 from cli_runner import children, is_running, stat_words
 from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 
 from gp_ground_seg.core.jit import HAVE_NUMBA
+from gp_ground_seg.core.parameters.schema import read_yaml, sections_of
 from gp_ground_seg.ros.arguments import unused_files
 from gp_ground_seg.ros.node import main
 from gp_ground_seg.ros.session import ROS_WHEELS, ros_session, stop_on_signals
@@ -30,7 +32,13 @@ FILES = {
     HEAD + '    grid: {n_segments: 999999999999999999999}\n': 'must be an integer',
     HEAD + '    use_sim_time: "yes"\n': 'must be true or false',
     HEAD + '    grid:\n': 'No value at line 3',
-    HEAD + '    grid: {n_bins: [1, 2.5]}\n': 'should be of same type',
+    HEAD + '    grid: {n_bins: [1, 2.5]}\n': 'd.yaml: grid.n_bins = [1, 2.5]: must have one type',
+    HEAD
+    + '    input.crop_box: [-1, 0.3, 0.0]\n': 'd.yaml: input.crop_box = [-1, 0.3, 0.0]: must h',
+    HEAD
+    + '    input: {crop_box: []}\n': 'd.yaml: input.crop_box = []: ROS does not read an empty',
+    HEAD + '    grid: {n_bins: 1_80}\n': "d.yaml: grid.n_bins = '1_80': must be an integer",
+    'a/:\n  ros__parameters: {sensor.height: 1.0}\n': 'node name must not be empty',
     'label: {ground_tolerance: 0.1}\n': 'd.yaml: no ros__parameters, which the node needs',
     '/**:\n  a:\n    grid: {n_bins: 50}\n': 'd.yaml: no ros__parameters',
     'just words\n': 'd.yaml: no ros__parameters',
@@ -45,17 +53,35 @@ WORDS = {
     '--params-file': 'No file path provided',
     '-p label.ground_tolerance': "rule: '-p label.ground_tolerance'",
     '-r points': "parse remap rule: '-r points'",
-    '-r points:=/1;2': "'-r points:=/1;2'",
-    '-r __node:=1st': '__node:=1st',
-    '-r __ns:=front': '__ns:=front',
+    **{
+        f'-r {rule}': f"'-r {rule}'. .*: must be OLD:=NEW, of topics such as /front/points: words"
+        for rule in (
+            'points:=/1;2',
+            '__node:=1st',
+            '__ns:=front',
+            '__ns:=/1a',
+            'points:=lidar/',
+            'points:=/1lidar',
+            'points:=/a//b',
+            'points:=/front-left',
+            'points=/a',
+        )
+    },
+    '-r __ns:=/front/': 'invalid node namespace: .*: must be OLD:=NEW',
+    '-p sensor.height:1': "'-p sensor.height:1'.*: must be NAME:=VALUE, as in sensor.height:=1.2",
     '--nonsense': "UnknownROSArgsError: ['--nonsense']",
-    '--log-level loud': 'does not use a valid severity level',
+    '--log-level loud': 'valid severity level: must be debug, info, warn, error or fatal',
     f'-p {QOS}.reliability:=maybe': 'policy `reliability`: `maybe`',
     f'-p {QOS}.depth:=-3': 'depth = -3: must be an integer in [1, 10000]',
     '-p input.crop_box:=[1.0,0.0,0.0,1.0,0.0,1.0]': 'must be none or six numbers in [-100',
-    '-p input.crop_box:=[]': 'null or an empty list',
-    'ROS_DOMAIN_ID=999': 'must be an integer in [0, 232]',
-    'ROS_DOMAIN_ID=a': 'not an integral',
+    '-p input.crop_box:=[]': 'an empty list: ROS does not read an empty list; write none',
+    **{
+        f'ROS_DOMAIN_ID={value}': f'= {value}: must be an integer in [0, 232]'
+        for value in ('999', 'a', '-1')
+    },
+    'RCUTILS_COLORIZED_OUTPUT=yes': 'OUTPUT = yes: must be an integer in [0, 1]',
+    'RCUTILS_LOGGING_USE_STDOUT=true': 'STDOUT = true: must be an integer in [0, 1]',
+    'RCUTILS_LOGGING_BUFFERED_STREAM=2': 'STREAM = 2: must be an integer in [0, 1]',
 }
 if importlib.util.find_spec('tf2_ros') is None:
     WORDS['-p frame.level:=tf'] = (
@@ -66,9 +92,9 @@ if importlib.util.find_spec('tf2_ros') is None:
 
 @pytest.mark.parametrize('given', [*FILES, *WORDS])
 def test_what_is_refused_is_said_in_one_line(tmp_path, monkeypatch, capfd, given):
-    if given.startswith('ROS_'):
+    if given.startswith('R'):
         monkeypatch.setenv(*given.split('='))
-    words = [word for word in given.split() if word[:4] != 'ROS_']
+    words = [word for word in given.split() if word[0] != 'R']
     if given in FILES:
         path = tmp_path / 'b\x1b[2Ja\nd.yaml'
         path.write_bytes(given.encode('latin-1'))
@@ -78,7 +104,8 @@ def test_what_is_refused_is_said_in_one_line(tmp_path, monkeypatch, capfd, given
     line = said.err.splitlines()[-1]
     assert said.out == '' and 'Traceback' not in said.err
     assert line.startswith('ground_segmentation_node: error: ')
-    assert {**FILES, **WORDS}[given] in line and line.isprintable() and '.c:' not in line
+    parts = {**FILES, **WORDS}[given].split('.*')
+    assert all(part in line for part in parts) and line.isprintable() and '.c:' not in line
 
 
 @pytest.mark.parametrize('words', ['node nonsense', 'node --ros-args -- nonsense'])
@@ -131,6 +158,62 @@ def test_missing_ros_is_said_in_one_line(tmp_path):
     for command, line in zip(('the node', 'play', 'the demo'), lines, strict=True):
         assert f'{command} needs ROS 2, which cannot be imported' in line
         assert f'pip install {ROS_WHEELS}' in line
+
+
+@pytest.mark.parametrize('name', ['rmw_cyclonedds_cpp', 'rmw_connextdds', 'fastrtps'])
+@pytest.mark.parametrize('words', [MODULE, ('-m', 'gp_ground_seg', 'demo')])
+def test_middleware_of_another_installation_is_named(words, name):
+    line = failure(*words, env={**os.environ, 'RMW_IMPLEMENTATION': name})
+    package = f'ros-jazzy-{name.replace("_", "-")}'
+    assert f'RMW_IMPLEMENTATION = {name}: is not installed here: unset it, or in' in line
+    assert line.endswith(f'stall {package}')
+
+
+NUMBERS = (
+    '1', '+1', '-1', '010', '09', '0o17', '0b11', '0x1F', '1_80', '1:30', '1.', '.5', '-.5', '1e3',
+    '1e400', '0x1p3', '99999999999999999999', '2026-11-28', 'inf', '.inf', '-.INF', '1,5', 'y',
+    '!!str 5', 'Y', 'yes', 'On', 'oN', 'TRUE', 'off', 'N', '"no"', '~', 'null', '=', '<<',
+    '[1, 2]', '[1.0, 0x2p0]', '[y, no]', '[a, "1"]', '|-\n      a', '!!float 1', 'fax', '-0x10',
+)  # fmt: skip
+
+
+def test_words_are_read_as_rcl_reads_them(tmp_path):
+    path = tmp_path / 'words.yaml'
+    lines = [f'    w{k}: {word}\n' for k, word in enumerate(NUMBERS)]
+    path.write_text(HEAD + ''.join(lines))
+    options = {'automatically_declare_parameters_from_overrides': True}
+    with ros.isolated_context() as context:
+        words = ['--ros-args', '--params-file', str(path)]
+        node = rclpy.create_node('words', context=context, cli_args=words, **options)
+        theirs = [node.get_parameter(f'w{k}').value for k in range(len(NUMBERS))]
+    ((_, ours),) = sections_of(read_yaml(path))
+    for word, value, own in zip(NUMBERS, theirs, ours.values(), strict=True):
+        value = [*value] if isinstance(own, list) else value
+        assert (value, type(value)) == (own, type(own)), word
+
+
+AGREED = {
+    'front:\n  ground_segmentation_node:\n    ros__parameters: {sensor.height: 1.2}\n': 0,
+    HEAD + '    frame.base: 2026-11-28\n': 0,
+    HEAD + '    {sensor.height: 1, surface.look_aside: n, input.crop_box: none}\n': 0,
+    HEAD + '    use_sim_time: true\nother:\n  ros__parameters: {a: [], b: [1, 2]}\n': 0,
+    '/**:\n  ros__parameters: {sensor.height: 1}\nfront/ground_segmentation_node:\n'
+    '  ros__parameters: {sensor.height: 2.0}\n': 0,
+    **dict.fromkeys(FILES, 2),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('text', AGREED)
+def test_check_and_the_node_agree(tmp_path, capsys, text):
+    path = tmp_path / 'my.yaml'
+    path.write_bytes(text.encode('latin-1'))
+    is_bare = 'ros__' not in text and cli_runner.run('config', 'check', path) == 0
+    assert is_bare == ('not in the form of ROS' in capsys.readouterr().out)
+    assert is_bare or cli_runner.run('config', 'check', path) == AGREED[text], capsys.readouterr()
+    if AGREED[text] == 0:
+        words = '-r', '__ns:=/front', '--params-file', str(path)
+        with ros.started_node(*words) as node:
+            assert unused_files(words, node.get_fully_qualified_name()) == []
 
 
 NAME = f'{NAMESPACE}/front/filter'

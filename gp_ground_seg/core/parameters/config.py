@@ -25,6 +25,7 @@ from gp_ground_seg.core.parameters.schema import (
     advanced,
     basic,
     did_you_mean,
+    parameters_of,
 )
 
 NO_FRAME = 'none'
@@ -442,7 +443,7 @@ def config_of(given: Config | str | Path | Mapping[str, Any] | None, **values: A
     ----------
     given : Config, str, Path, dict or None
         Parameters themselves; the name of a preset; a YAML file, as a word with its suffix too;
-        values by dotted name; or None for the defaults.
+        values by dotted name, or in groups as in such a file; or None for the defaults.
     **values
         Further values, by name with ``_`` in place of the dot: ``sensor_height=1.73``.
 
@@ -454,7 +455,7 @@ def config_of(given: Config | str | Path | Mapping[str, Any] | None, **values: A
     if isinstance(given, Config):
         config = given
     elif given is None or isinstance(given, Mapping):
-        config = Config().replace(**{**given} if given else {})
+        config = Config().replace(**parameters_of(given))
     elif isinstance(given, Path) or str(given).endswith(YAML_SUFFIXES):
         config = Config.from_yaml(given)
     else:

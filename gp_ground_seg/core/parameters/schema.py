@@ -6,14 +6,15 @@ import contextlib
 import dataclasses
 import difflib
 import functools
+import math
 import numbers
 import re
 import textwrap
-from collections import Counter, namedtuple
-from collections.abc import Iterable, Iterator, Mapping
+from collections import namedtuple
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, cast
 
 import yaml
 
@@ -33,13 +34,16 @@ NODE_NAME = 'ground_segmentation_node'
 ROS_PARAMETERS_KEY = 'ros__parameters'
 MAX_FILE_BYTES = 1 << 18  # twenty times the largest of config/
 MAX_VALUES = 500  # of a file: five times those there are
-MAX_DIGITS = 100  # of an integer; Python cannot print one of more than 4,300
 YAML_SUFFIXES = ('.yaml', '.yml')
 NO_VALUES = 'no parameters of the segmentation in it'
+FORM_OF_ROS = (
+    'the node needs; from bare groups: gp-ground-seg config dump --config FILE > ros.yaml'
+)
+EMPTY_LIST = 'ROS does not read an empty list; write none'
 _WIDTH, _INDENT = 99, '  '  # of the lines of a file that is written
 _NBSP = '\xa0'  # textwrap does not break here
-OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
-"""Parameters that every ROS node has."""
+OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
+"""Parameters that every ROS node has, or how their names begin."""
 
 
 @dataclass(frozen=True)
@@ -205,22 +209,19 @@ class ParameterGroups:
         raise ConfigError(f'unknown parameter {name!r}{did_you_mean(name, specs)}')
 
     def __post_init__(self) -> None:
-        """Check every value."""
-        checked = {name: spec.check(self[name]) for name, spec in self.specs().items()}
-        # A whole number given for a float becomes one, in a group of our own.
-        for group_name, group in self._groups(checked).items():
-            object.__setattr__(self, group_name, group)
-
-    def _groups(self, values: Mapping[str, object]) -> dict[str, Any]:
-        """Return groups with some values changed, by name."""
-        nested: dict[str, dict[str, Any]] = {}
-        for name, value in values.items():
-            group_name, field_name = name.split('.')
-            nested.setdefault(group_name, {})[field_name] = value
-        return {
-            name: dataclasses.replace(getattr(self, name), **group)
-            for name, group in nested.items()
-        }
+        """Check every value; a group may be a mapping of some of its values."""
+        for group in dataclasses.fields(self):
+            kind: Any = type(group.default)
+            given = getattr(self, group.name)
+            values = vars(given) if isinstance(given, kind) else given
+            if not isinstance(values, Mapping):
+                raise ConfigError(f'{group.name} = {given!r}: must be a mapping of its parameters')
+            # A whole number given for a float becomes one, in a group of our own.
+            checked = {
+                name: self.find_spec(f'{group.name}.{name}').check(value)
+                for name, value in {**vars(group.default), **values}.items()
+            }
+            object.__setattr__(self, group.name, kind(**checked))
 
     def __getitem__(self, name: str) -> Any:
         """Value of the parameter with the dotted `name`, in its declared type."""
@@ -236,12 +237,15 @@ class ParameterGroups:
         return dataclasses.asdict(self)
 
     def replace(self, **changes: object) -> Self:
-        """Copy with some values changed, given by dotted names (``**{'grid.r_max': 60.0}``).
+        """Copy with some values changed, by dotted name (``**{'grid.r_max': 60.0}``) or in groups.
 
         Raises ConfigError if a name is unknown or the changed configuration is invalid.
         """
-        values = {self.find_spec(name).name: value for name, value in changes.items()}
-        return dataclasses.replace(self, **self._groups(values))
+        nested: dict[str, Any] = self.nested()
+        for name, value in flatten(changes).items():
+            group_name, field_name = self.find_spec(name).name.split('.')
+            nested[group_name][field_name] = value
+        return type(self)(**nested)
 
     @classmethod
     def from_yaml(cls, path: str | Path, base: Self | None = None) -> Self:
@@ -251,14 +255,10 @@ class ParameterGroups:
         with the path, if the file cannot be read, a name is unknown, or a value is not accepted.
         """
         try:
-            file = read_parameters(path)
-            if not file.is_ours:
-                raise ConfigError(
-                    f'parameters of node {file.node}; must be of {ROS_NODE_KEY} or {NODE_NAME}'
-                )
-            if not file.values:
+            values = parameters_of(read_yaml(path))
+            if not values:
                 LOGGER.warning('%s: %s', path, NO_VALUES)
-            return (base or cls()).replace(**file.values)
+            return (base or cls()).replace(**values)
         except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error
 
@@ -268,19 +268,20 @@ class ParameterGroups:
 
         Rules between parameters are checked where each value by itself is accepted.
         """
-        problems = []
+        problems: list[str] = []
         try:
-            values = read_parameters(path).values
-            for name, value in values.items():
-                try:
-                    cls.find_spec(name).check(value)
-                except ConfigError as error:
-                    problems.append(str(error))
-            if not problems:
-                cls().replace(**values)
+            for _, values in nodes_of(read_yaml(path)):
+                n_before = len(problems)
+                for name, value in values.items():
+                    try:
+                        cls.find_spec(name).check(value)
+                    except ConfigError as error:
+                        problems.append(str(error))
+                if len(problems) == n_before:
+                    cls().replace(**values)
         except ConfigError as error:
             problems.append(str(error))
-        return problems
+        return [*dict.fromkeys(problems)]
 
     def differences(self, other: Self) -> list[tuple[ParameterSpec, Any, Any]]:
         """Parameters that differ, with the value here and in `other`, in order of declaration."""
@@ -339,8 +340,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f'; did you mean {near[0]}?' if near else ''
 
 
-class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, without some of its surprises (see `load_yaml`)."""
+class _Loader(yaml.BaseLoader):
+    """Reads plain words as ROS's own parser, rcl_yaml_param_parser, does.
+
+    YAML 1.1 has more: ``1_80`` and ``1:20`` are integers there, ``2026-11-28`` is a date.
+    """
+
+    DEFAULT_SCALAR_TAG: Any = ''  # type: ignore[misc]  # a word behind ``!!str`` has another
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """Refuse aliases, as ROS does: a kilobyte of them can stand for gigabytes."""
@@ -350,33 +356,41 @@ class _Loader(yaml.SafeLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Refuse a key that is there twice; the last would win silently."""
-        keys = (key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-        _refuse_repeated(keys, f', from line {node.start_mark.line + 1} on')
-        return super().construct_mapping(node, deep)
+        values: dict[Any, Any] = {}
+        for key, value in node.value:
+            name = super().construct_scalar(key)
+            if name in values:
+                raise ConfigError(f'{name}: given twice, line {key.start_mark.line + 1}')
+            values[name] = self.construct_object(value, deep=True)
+        return values
+
+    def construct_scalar(self, node: yaml.ScalarNode) -> Any:
+        """Return a switch or a number where a plain word is one, and None where there is none."""
+        text = super().construct_scalar(node)
+        if node.style in ('"', "'") or node.tag == 'tag:yaml.org,2002:str':
+            return text
+        if text in _SWITCHES:
+            return _SWITCHES[text]
+        if not text.isascii() or '_' in text:  # which Python has in numbers, and C has not
+            return text
+        word = text.lower().replace('.inf', 'inf').replace('.nan', 'nan')
+        is_octal = word.lstrip('+-').isdigit() and word.lstrip('+-')[0] == '0'
+        with contextlib.suppress(ValueError):
+            number = int(word, 16 if 'x' in word else 8 if is_octal else 10)
+            if -(2**63) <= number < 2**63:
+                return number
+        with contextlib.suppress(ValueError, OverflowError):
+            value = float.fromhex(word) if 'x' in word else float(word)
+            if math.isfinite(value) or 'n' in word:
+                return value
+        return text or None
 
 
-def _refuse_repeated(names: Iterable[str], where: str = '') -> None:
-    if twice := [name for name, n_times in Counter(names).items() if n_times > 1]:
-        raise ConfigError(f'{twice[0]}: given twice{where}')
-
-
-def _construct_int(loader: _Loader, node: yaml.ScalarNode) -> int:
-    if len(node.value) > MAX_DIGITS:
-        raise ConfigError(f'line {node.start_mark.line + 1}: a number of {len(node.value)} digits')
-    return loader.construct_yaml_int(node)
-
-
-_Loader.add_constructor('tag:yaml.org,2002:int', _construct_int)
-# What launch_ros writes for a list, which rcl reads as one.
-_Loader.add_constructor(
-    'tag:yaml.org,2002:python/tuple',
-    _Loader.construct_sequence,  # type: ignore[type-var]
-)
-_Loader.add_implicit_resolver(
-    'tag:yaml.org,2002:float',
-    re.compile(r'^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$'),
-    list('-+.0123456789'),
-)
+_SWITCHES = {
+    form: word in ('y', 'yes', 'true', 'on')
+    for word in ('y', 'yes', 'true', 'on', 'n', 'no', 'false', 'off')
+    for form in (word, word.capitalize(), word.upper())
+}
 
 
 def read_yaml(path: str | Path) -> object:
@@ -395,7 +409,7 @@ def read_yaml(path: str | Path) -> object:
 
 
 def load_yaml(text: str) -> object:
-    """Read YAML, with 1e-3 a number as in ROS.
+    """Read YAML, with the values that ROS reads.
 
     Raises ConfigError if it is none, has aliases or a key twice, or cannot be of parameters.
     """
@@ -403,62 +417,90 @@ def load_yaml(text: str) -> object:
         return yaml.load(text, Loader=_Loader)
     except ConfigError:
         raise
-    except Exception as error:  # of many types: 2011-99-99, `!!int x`, `!!bool x`, ...
+    except Exception as error:  # of many types: nested too deep, a list as a key, ...
         raise ConfigError(f'not valid YAML: {in_one_line(error)}') from error
 
 
-class ParameterFile(NamedTuple):
-    """Values of a parameter file by dotted names, unchecked."""
-
-    values: dict[str, object]
-    node: str  # whose they are, in the form of ROS; '' for bare groups
-
-    @property
-    def is_ours(self) -> bool:
-        """Whether a node of our name, and commands, use it."""
-        return self.node.split('/')[-1] in ('', '*', '**', NODE_NAME)
+def is_ours(node: str) -> bool:
+    """Whether commands, and a node of our name, use the values of a key; '' is of bare groups."""
+    return node.split('/')[-1] in ('', '*', '**', NODE_NAME)
 
 
-def read_parameters(path: str | Path) -> ParameterFile:
-    """Read a parameter file; ConfigError if it cannot be read or parsed, or gives a name twice."""
-    groups, node = _unwrap_ros(read_yaml(path))
-    given = list(_flatten(groups))
-    if len(given) > MAX_VALUES:
-        raise ConfigError(f'more than {MAX_VALUES} values, too many for a parameter file')
-    _refuse_repeated(name for name, _ in given)
-    return ParameterFile(dict(given), node)
+def parameters_of(document: object) -> dict[str, object]:
+    """Return the values of a parameter file that commands use; ConfigError if of several nodes."""
+    (node, values), *others = nodes_of(document)
+    if others or not is_ours(node):
+        names = ', '.join([node, *(other for other, _ in others)])
+        wanted = f'{ROS_NODE_KEY} or {NODE_NAME} alone'
+        raise ConfigError(f'parameters of node {names}; must be of {wanted}')
+    return values
 
 
-def _unwrap_ros(document: object) -> tuple[Mapping[str, object], str]:
-    """Return groups of parameters, and the node that a file names; '' if it names none."""
-    if document is None:
-        return {}, ''
+def nodes_of(document: object) -> list[tuple[str, dict[str, object]]]:
+    """Return the nodes that a parameter file is for, and the values of each, unchecked.
+
+    Its keys of any node are for each of ours; bare groups are of the node ''. ConfigError if it
+    cannot be a parameter file, or our node would not start with it.
+    """
+    document = {} if document is None else document
     if not isinstance(document, Mapping):
         raise ConfigError('must be a mapping of parameter groups')
-    if not any(
-        str(key).startswith('/') or (isinstance(value, Mapping) and ROS_PARAMETERS_KEY in value)
-        for key, value in document.items()
-    ):
-        return document, ''  # bare groups
-    if len(document) != 1:
-        raise ConfigError(f'parameters of {len(document)} nodes; keep one, keyed {ROS_NODE_KEY}')
-    ((node, below),) = document.items()
-    if not isinstance(below, Mapping) or not isinstance(below.get(ROS_PARAMETERS_KEY), Mapping):
-        raise ConfigError(f'no mapping {ROS_PARAMETERS_KEY} below the node name')
-    if len(below) > 1:
-        raise ConfigError(f'values beside {ROS_PARAMETERS_KEY}, which ROS refuses')
-    # Names that every ROS node has are no parameters of the segmentation.
-    return {
-        key: value
-        for key, value in below[ROS_PARAMETERS_KEY].items()
-        if key not in OF_EVERY_NODE and not str(key).startswith('qos_overrides')
-    }, str(node)
+    sections = sections_of(document)
+    if not sections:
+        if any(str(key).startswith('/') for key in document):
+            raise ConfigError(f'no mapping {ROS_PARAMETERS_KEY} below the node name')
+        return [('', flatten(document))]
+    ours = [section for section in sections if is_ours(section[0])] or sections
+    names = dict.fromkeys(node for node, _ in ours if '*' not in node) or [ours[0][0]]
+    nodes = []
+    for name in names:
+        given: dict[str, Any] = {}
+        for node, values in ours:
+            given |= values if node == name or '*' in node else {}
+        nodes.append((name, given))
+        if not isinstance(given.get('use_sim_time', False), bool):
+            raise ConfigError(f'use_sim_time = {given["use_sim_time"]!r}: must be true or false')
+        if empty := [name for name, value in given.items() if value == []]:
+            raise ConfigError(f'{empty[0]} = []: {EMPTY_LIST}')
+        for of_every_node in [name for name in given if name.startswith(OF_EVERY_NODE)]:
+            del given[of_every_node]
+    return nodes
 
 
-def _flatten(tree: Mapping[str, object], prefix: str = '') -> Iterator[tuple[str, object]]:
+def sections_of(document: object, above: str = '') -> list[tuple[str, dict[str, object]]]:
+    """Return the keys of nodes, with nested namespaces, and the values of each; none if bare.
+
+    ConfigError where ROS cannot read a section.
+    """
+    found: list[tuple[str, dict[str, object]]] = []
+    groups: Mapping[object, Any] = document if isinstance(document, Mapping) else {}
+    for key, below in groups.items():
+        if key != ROS_PARAMETERS_KEY:
+            found += sections_of(below, f'{above}/{key}' if above else str(key))
+            continue
+        if not isinstance(below, Mapping):
+            raise ConfigError(f'no mapping {ROS_PARAMETERS_KEY} below the node name')
+        if len(groups) > 1:
+            raise ConfigError(f'values beside {ROS_PARAMETERS_KEY}, which ROS refuses')
+        values = flatten(below)
+        found.append((above, values))
+        for name, value in values.items():
+            kinds = [type(one) for one in value] if isinstance(value, list) else []
+            if list in kinds or len({*kinds}) > 1:
+                hint = f': write {value[kinds.index(int)]}.0' if {*kinds} == {int, float} else ''
+                raise ConfigError(f'{name} = {value}: must have one type for ROS{hint}')
+    return found
+
+
+def flatten(tree: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
+    """Return the values of nested groups by dotted names; ConfigError if one is given twice."""
+    values: dict[str, Any] = {}
     for key, value in tree.items():
         name = f'{prefix}{key}'
-        if isinstance(value, Mapping):
-            yield from _flatten(value, f'{name}.')
-        else:
-            yield name, value
+        found = flatten(value, f'{name}.') if isinstance(value, Mapping) else {name: value}
+        if twice := values.keys() & found.keys():
+            raise ConfigError(f'{min(twice)}: given twice')
+        values |= found
+    if len(values) > MAX_VALUES:
+        raise ConfigError(f'more than {MAX_VALUES} values, too many for a parameter file')
+    return values

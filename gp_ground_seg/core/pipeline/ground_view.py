@@ -67,10 +67,10 @@ LOWER_ENDS = (
     'the lowest returns are the lower ends of objects: the ground is not seen, or was cut away '
     'before, by a crop box or a pass-through filter'
 )
-FAR_OFF, TINY, HUGE = 10.0, 0.5, 200.0
+FAR_OFF, TINY, HUGE, UNEQUAL = 10.0, 0.5, 200.0, 4.0
 """Range of the nearest hundredth of the returns [m] from which the origin is not the sensor. Range
 of nearly all [m] below which a cloud is not in metres; of half of them, above which it is not, if
-the farthest are ten times as far as the nearest."""
+the farthest are four times as far as the nearest: those of a distant scan are as far."""
 
 UPRIGHT, *OTHER_AXES = (
     rotation(0.5 * math.pi * roll, 0.5 * math.pi * pitch)
@@ -185,7 +185,7 @@ def objection_to_ground(scan: Scan, view: View | None) -> str:
     if len(r) == 0:
         return ''
     nearest, middle, farthest = np.quantile(r, (0.01, 0.5, 0.99)).tolist()
-    if farthest < TINY or (middle > HUGE and farthest > FAR_OFF * nearest):
+    if farthest < TINY or (middle > HUGE and farthest > UNEQUAL * nearest):
         return f'half of the returns are within {middle:.3g} m: the cloud is not in metres'
     if nearest > FAR_OFF:
         return (

@@ -52,14 +52,16 @@ def take_points(points: npt.ArrayLike, origin: Direction | None = None) -> Point
     if array.ndim != 2 or array.shape[1] < 3:
         raise PointCloudError(
             f'points of shape {array.shape} and type {array.dtype}: must be (N, 3) or wider'
+            f'{reshape_hint(array.shape)}'
         )
     if array.shape[0] <= _MOST_ROWS and array.shape[1] >= _LEAST_COLUMNS:
         raise PointCloudError(
             f'points of shape {array.shape}: a point is a row; pass points.T, if they are columns'
         )
     if not np.issubdtype(array.dtype, np.floating):
+        hint = '; pass points.astype(float)' if array.dtype.kind in 'iu' else ''
         raise PointCloudError(
-            f'points of shape {array.shape} and type {array.dtype}: must be floating point'
+            f'points of shape {array.shape} and type {array.dtype}: must be floating point{hint}'
         )
     xyz = array[:, :3]
     # Bytes from a sensor may be a signalling NaN, one more value that is not finite.
@@ -73,6 +75,12 @@ def take_points(points: npt.ArrayLike, origin: Direction | None = None) -> Point
     if problem := objection_to_ranges(xyz[:: 1 + len(xyz) // _N_JUDGED]):
         raise PointCloudError(problem)
     return xyz
+
+
+def reshape_hint(shape: tuple[int, ...]) -> str:
+    """Return how an image of points, as of a camera or an organised scan, becomes a table."""
+    is_image = len(shape) > 2 and shape[-1] >= 3
+    return f'; an image of points is a table after .reshape(-1, {shape[-1]})' if is_image else ''
 
 
 def leave_out_empty_rays(xyz: PointArray, origin: Direction, written: np.dtype[Any]) -> None:
