@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
+from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 
@@ -42,6 +44,7 @@ MODEL_FIELDS = (
 horizontal range of the knot in the level frame, and, equal in all points, the angles that turn the
 cloud's frame into the level one, and the place of the sensor in it."""
 OUTPUT_DEPTH = 20  # messages kept: Fast DDS may send a lost fragment again after 0.7 s only
+MAP_LIFESPAN = 0.9  # a grid for a reader that comes later has been sent so long ago at most [s]
 LONGEST_PERIOD = 1.0
 """Time between two clouds [s] from which on some are missing: ``scan_time`` is 0 then."""
 
@@ -170,6 +173,17 @@ OUTPUTS = (
 )
 
 
+def profile_of(output: Output) -> QoSProfile:
+    """Return the QoS of a topic; a map also serves readers that are transient local.
+
+    These get no old one: DDS keeps it for its lifespan only.
+    """
+    if output.message_type is not OccupancyGrid:
+        return QoSProfile(depth=OUTPUT_DEPTH)
+    latched, lifespan = DurabilityPolicy.TRANSIENT_LOCAL, Duration(seconds=MAP_LIFESPAN)
+    return QoSProfile(depth=OUTPUT_DEPTH, durability=latched, lifespan=lifespan)
+
+
 class OutputPublishers:
     """Publishers of all outputs of `node`."""
 
@@ -178,7 +192,7 @@ class OutputPublishers:
     def __init__(self, node: Node) -> None:
         options = {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
         self._publishers = [
-            (o, node.create_publisher(o.message_type, o.topic, OUTPUT_DEPTH, **options))
+            (o, node.create_publisher(o.message_type, o.topic, profile_of(o), **options))
             for o in OUTPUTS
         ]
 

@@ -100,7 +100,7 @@ class CloudFrames(NamedTuple):
     origin: tuple[float, float, float] | None = None  # place of the sensor in it [m]
     # rotation (3, 3) and translation (3,) [m] into ``frame.base``
     base: tuple[FloatArray, FloatArray] | None = None
-    age: float = 0.0  # longest time between the cloud and a transform or an orientation [s]
+    age: float | None = None  # longest time from the cloud to a transform or orientation [s]
     waited: float = 0.0  # how long the cloud was held [s]
 
 
