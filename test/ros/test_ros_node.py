@@ -277,7 +277,7 @@ def test_stamps_of_another_clock_are_a_warning(b, off, said):
         sent = send_time + k * 10**9
         seconds, rest = divmod(sent - round(1e9 * (off or 0.0)), 10**9)
         stamp = (seconds, rest) if off is not None else (send_time // 10**9, 0)
-        info = {'source_timestamp': sent, 'received_timestamp': sent}
+        info = {'source_timestamp': sent}
         b.in_executor(b.node._input._receive, to_message(street(50), stamp), info)
     status = b.wait_for_status('input', lambda *_: True)
     level = DiagnosticStatus.WARN if said else DiagnosticStatus.OK
