@@ -60,7 +60,7 @@ class InputTask:
         # Clouds of the newest reporting period that had any.
         self._n_recent = self._n_refused_recent = 0
         self._is_reported = True
-        self._frame = self._fields = self._last_error = ''
+        self.frame = self._fields = self._last_error = ''
         self._stamp: float | None = None
 
     def arrived(self, now: float, cloud: PointCloud2) -> None:
@@ -72,7 +72,7 @@ class InputTask:
         self._last_arrival = now
         self._n_arrived += 1
         self._arrivals.append(now)
-        self._stamp, self._frame = seconds_of(cloud.header.stamp), cloud.header.frame_id
+        self._stamp, self.frame = seconds_of(cloud.header.stamp), cloud.header.frame_id
         self._fields = ' '.join(field.name for field in cloud.fields)
 
     def refused(self, reason: str) -> None:
@@ -109,7 +109,7 @@ class InputTask:
             'Time since last cloud (s)': f'{now - self._last_arrival:.3f}',
             'Age of last stamp (s)': _digits(age, '.3f'),
             'Time jumps since startup': str(self._n_time_jumps),
-            'Frame': self._frame,
+            'Frame': self.frame,
             'Fields': self._fields,
             'Refused since startup': str(self.n_refused),
             'Last error': self._last_error,
@@ -291,24 +291,16 @@ class Diagnostics:
         self.processing.arrived(n_lost)
 
     def published(
-        self,
-        frame: str,
-        scan: Segmentation,
-        arrival: float,
-        stages: Mapping[str, float],
-        age: float | None,
+        self, scan: Segmentation, arrival: float, stages: Mapping[str, float], age: float | None
     ) -> None:
-        """Count the cloud in `frame` that came at the time `arrival` [s]; log its stages.
-
-        `age` is as in `ProcessingTask.processed`.
-        """
+        """Count the cloud that came at `arrival` [s], as in `processed`; log its stages."""
         logger, backend = self._node.get_logger(), scan.fit.backend
         if logger.is_enabled_for(LoggingSeverity.DEBUG):
             times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
             logger.debug(f'times of the stages [ms]: {times}')
         if self._newest is None:
             logger.info(
-                f'first cloud: frame {frame!r}, {len(scan.label)} points, sensor '
+                f'first cloud: frame {self.input.frame!r}, {len(scan.label)} points, sensor '
                 f'{scan.pose.sensor_height:.2f} m over the ground, segmented with {backend}'
             )
         self.processing.processed(time.monotonic() - arrival, backend, stages, age)
@@ -316,11 +308,8 @@ class Diagnostics:
 
     def summary(self) -> str:
         """Return what became of the clouds so far."""
-        done = self.processing
-        return (
-            f'ends: {done.n_processed} clouds segmented, {done.n_dropped} lost, '
-            f'{self.input.n_refused} refused'
-        )
+        n_done, n_lost = self.processing.n_processed, self.processing.n_dropped
+        return f'ends: {n_done} clouds segmented, {n_lost} lost, {self.input.n_refused} refused'
 
     def _report(self) -> list[Status]:
         """Return the status of each task; log that the node works, if it does."""

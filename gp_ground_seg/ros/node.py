@@ -140,7 +140,7 @@ class GroundSegmentationNode(ConfiguredNode):
         publishing, waited = time.monotonic() - segmented, frames.waited
         before = {'queue': start - arrival - waited, 'frames': waited}
         stages = {**before, **result.timings, 'publish': publishing}
-        self._diagnostics.published(header.frame_id, result, arrival, stages, frames.age)
+        self._diagnostics.published(result, arrival, stages, frames.age)
 
     def _why_idle(self) -> str:
         """Why no clouds are wanted now; empty if they are."""
@@ -212,11 +212,6 @@ class GroundSegmentationNode(ConfiguredNode):
         if self._frames is None and (config.frame.level == 'imu' or is_tf_used(config)):
             self._frames = FrameListener(self, config, self._on_cloud)
         self._input.callback = self._frames.hold if self._frames else self._on_cloud
-
-    def say_end(self) -> None:
-        """Log how many clouds were segmented and lost, before the context ends."""
-        if self.context.ok():
-            self.get_logger().info(self._diagnostics.summary())
 
     def destroy_node(self) -> None:
         """Free what the node holds."""
@@ -371,7 +366,7 @@ def main(args: Sequence[str] | None = None, *, is_managed: bool = False) -> int:
             for line in unused_files(words, node.get_fully_qualified_name()):
                 node.get_logger().warning(line)
             _spin(node, stop)
-            node.say_end()
+            node.get_logger().info(node._diagnostics.summary())
         except GroundSegError as error:
             problem = with_file(str(error), words)
             sys.stderr.write(f'{NODE_NAME}: error: {shown(problem)}\n')

@@ -56,6 +56,7 @@ class Output(NamedTuple):
     message_type: type
     build: Callable[[SegmentedCloud], Any]
     is_optional: bool  # built only while it has a subscriber
+    profile: QoSProfile = QoSProfile(depth=OUTPUT_DEPTH)
 
 
 def labelled_cloud(segmented: SegmentedCloud) -> PointCloud2:
@@ -163,25 +164,20 @@ def _selected(segmented: SegmentedCloud, chosen: BoolArray) -> PointCloud2:
     return select_points(segmented.cloud, chosen, message_bytes, are_finite=True)
 
 
+# Readers of maps are transient local, or not; DDS keeps no old one for those.
+_OF_MAPS = QoSProfile(
+    depth=OUTPUT_DEPTH,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    lifespan=Duration(seconds=MAP_LIFESPAN),
+)
 OUTPUTS = (
     Output('ground', PointCloud2, lambda s: _selected(s, s.is_ground), False),
     Output('obstacles', PointCloud2, lambda s: _selected(s, s.is_obstacle), False),
     Output('~/labeled', PointCloud2, labelled_cloud, True),
     Output('~/ground_model', PointCloud2, ground_model_cloud, True),
     Output('~/scan', LaserScan, scan, True),
-    Output('~/occupancy', OccupancyGrid, occupancy_grid, True),
+    Output('~/occupancy', OccupancyGrid, occupancy_grid, True, _OF_MAPS),
 )
-
-
-def profile_of(output: Output) -> QoSProfile:
-    """Return the QoS of a topic; a map also serves readers that are transient local.
-
-    These get no old one: DDS keeps it for its lifespan only.
-    """
-    if output.message_type is not OccupancyGrid:
-        return QoSProfile(depth=OUTPUT_DEPTH)
-    latched, lifespan = DurabilityPolicy.TRANSIENT_LOCAL, Duration(seconds=MAP_LIFESPAN)
-    return QoSProfile(depth=OUTPUT_DEPTH, durability=latched, lifespan=lifespan)
 
 
 class OutputPublishers:
@@ -192,7 +188,7 @@ class OutputPublishers:
     def __init__(self, node: Node) -> None:
         options = {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
         self._publishers = [
-            (o, node.create_publisher(o.message_type, o.topic, profile_of(o), **options))
+            (o, node.create_publisher(o.message_type, o.topic, o.profile, **options))
             for o in OUTPUTS
         ]
 

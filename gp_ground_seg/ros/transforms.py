@@ -105,10 +105,9 @@ class CloudFrames(NamedTuple):
 
 
 class Unattended(CallbackGroup):  # type: ignore[misc]
-    """Keeps subscriptions from the executor, which spends 0.3 ms on a message.
+    """Keeps subscriptions from the executor, which spends 0.3 ms on a message, and their events.
 
-    Who made them takes the messages. Their events are kept from it as well: data that nobody
-    takes would wake it all the time.
+    Data that nobody takes would wake it all the time.
     """
 
     def can_execute(self, _entity: object) -> bool:
@@ -154,23 +153,11 @@ class ImuListener:
         return found, off
 
 
-class TfListener:
-    """Keeps what TF has sent."""
-
-    def __init__(self) -> None:
-        tf2_ros = find_module('tf2_ros')
-        self.not_yet, self.too_late = tf2_ros.TransformException, tf2_ros.ExtrapolationException
-        # Without the node: given one, the buffer clears itself at jumps of the node's clock,
-        # and in some releases raises an error there that ends the executor. See `time_jumped`.
-        self.buffer = tf2_ros.Buffer()
-
-    def take(self, message: Any, is_static: bool = False) -> float:
-        """Keep a message; return its newest stamp [s]."""
-        buffer = self.buffer
-        keep = buffer.set_transform_static if is_static else buffer.set_transform
-        for transform in message.transforms:
-            keep(transform, 'default_authority')
-        return max((seconds_of(t.header.stamp) for t in message.transforms), default=0.0)
+def keep_transforms(keep: Callable[[Any, str], None], message: Any) -> float:
+    """Pass what TF has sent in a `message` to `keep`; return the newest stamp in it [s]."""
+    for transform in message.transforms:
+        keep(transform, 'default_authority')
+    return max((seconds_of(t.header.stamp) for t in message.transforms), default=0.0)
 
 
 class FrameListener:
@@ -185,33 +172,31 @@ class FrameListener:
     def __init__(self, node: Node, config: Config, use: OnCloud) -> None:
         self.config = config
         self._node, self._use = node, use
-        self._group = Unattended()
-        self._subscriptions: list[Any] = []
         self._news: dict[str, tuple[float, float]] = {}  # newest stamp and its arrival [s]
-        self._imu = self._tf = None
+        self._imu = self._buffer = None
         self._not_yet: Any = ()  # what TF raises
         self._too_late: Any = ()
+        sources: list[tuple[Any, str, Callable[[Any], float], QoSProfile]] = []
         if config.frame.level == 'imu':
             self._imu = ImuListener(node)
-            self._subscribe(Imu, 'imu', self._imu.take, BEST_EFFORT)  # takes from any publisher
-        if find_module('tf2_ros') is not None:
-            self._tf, tf_message = TfListener(), find_module('tf2_msgs.msg').TFMessage
-            self._not_yet, self._too_late = self._tf.not_yet, self._tf.too_late
-            self._subscribe(tf_message, '/tf', self._tf.take, RELIABLE)
-            take = partial(self._tf.take, is_static=True)
-            self._subscribe(tf_message, '/tf_static', take, LATCHED)
+            sources += [(Imu, 'imu', self._imu.take, BEST_EFFORT)]  # takes from any publisher
+        if (tf2 := find_module('tf2_ros')) is not None:
+            self._not_yet, self._too_late = tf2.TransformException, tf2.ExtrapolationException
+            # Without the node: given one, the buffer clears itself at jumps of the node's clock,
+            # and in some releases raises an error there that ends the executor. See `time_jumped`.
+            self._buffer = tf2.Buffer()
+            kind = find_module('tf2_msgs.msg').TFMessage
+            keep = partial(keep_transforms, self._buffer.set_transform)
+            keep_static = partial(keep_transforms, self._buffer.set_transform_static)
+            sources += [(kind, '/tf', keep, RELIABLE), (kind, '/tf_static', keep_static, LATCHED)]
+        group = Unattended()
+        self._subscriptions = [
+            node.create_subscription(*source, callback_group=group) for source in sources
+        ]
         self._waiting: deque[tuple[float, Header, Callable[[], None]]] = deque()
         self._held = 0.0  # how long the cloud that is used now was held [s]
         self._timer = node.create_timer(REVIEW_PERIOD, self._review, clock=STEADY_CLOCK)
         self._timer.cancel()
-
-    def _subscribe(
-        self, kind: type, topic: str, take: Callable[[Any], float], profile: QoSProfile
-    ) -> None:
-        subscription = self._node.create_subscription(
-            kind, topic, take, profile, callback_group=self._group
-        )
-        self._subscriptions.append(subscription)
 
     def hold(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
         """Keep a cloud until its transform and orientation are known."""
@@ -268,8 +253,7 @@ class FrameListener:
         frame_id, frame, stamp = header.frame_id, self.config.frame, seconds_of(header.stamp)
 
         def transform(target: str, source: str, way: str) -> Any:
-            look = self._exact if is_exact else self._nearest
-            found = look(target, source, Time.from_msg(header.stamp), way)
+            found = self._look_up(target, source, Time.from_msg(header.stamp), way, is_exact)
             ages.append(abs(stamp - seconds_of(found.header.stamp)))
             return found.transform
 
@@ -291,27 +275,25 @@ class FrameListener:
             origin = _translation_of(transform(frame_id, frame.sensor, way), way)
         return CloudFrames(tilt, origin, base, max(ages), self._held)
 
-    def _exact(self, target: str, source: str, stamp: Time, way: str) -> Any:
-        if self._tf is None:
+    def _look_up(self, target: str, source: str, stamp: Time, way: str, is_exact: bool) -> Any:
+        if self._buffer is None:
             raise PointCloudError(f'transform {way}: needs tf2_ros ({INSTALL_TF2})')
-        return self._tf.buffer.lookup_transform(target, source, stamp)
-
-    def _nearest(self, target: str, source: str, stamp: Time, way: str) -> Any:
         try:
-            try:
-                return self._exact(target, source, stamp, way)
-            except self._too_late:
-                # The newest: a sensor is fixed to its vehicle.
-                return self._exact(target, source, Time(), way)
+            return self._buffer.lookup_transform(target, source, stamp)
         except self._not_yet as error:
+            if is_exact:
+                raise
+            if isinstance(error, self._too_late) and stamp.nanoseconds:
+                # The newest: a sensor is fixed to its vehicle.
+                return self._look_up(target, source, Time(), way, is_exact)
             raise PointCloudError(f'no transform {way}: {error}') from error
 
     def time_jumped(self, seconds: float) -> None:
         """Forget all transforms after a long jump back, also those that were not taken yet."""
         self._take_all()
         self._news.clear()
-        if seconds > KEPT_JUMP and self._tf is not None:
-            self._tf.buffer.clear()
+        if seconds > KEPT_JUMP and self._buffer is not None:
+            self._buffer.clear()
 
     def close(self) -> None:
         """Stop listening; clouds that wait are dropped."""
