@@ -52,8 +52,7 @@ def check_tf2(config: Config) -> None:
     for name in ('base', 'sensor'):
         given = getattr(frame, name)
         if given.startswith('/'):
-            wanted = given.lstrip('/')
-            raise ConfigError(f'frame.{name} = {given}: must not begin with / (tf2): {wanted}')
+            raise ConfigError(f'frame.{name} = {given!r}: must not begin with /, as tf2 wants')
     if is_tf_used(config) and find_module('tf2_ros') is None:
         asked = 'level = tf' if frame.level == 'tf' else f'sensor = {frame.sensor}'
         raise MissingDependencyError(
