@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
@@ -268,22 +267,22 @@ class Diagnostics:
     """The three tasks of `node`, published every ``diagnostics.period``."""
 
     def __init__(self, node: Node, source: CloudSubscription, config: Config) -> None:
-        limits = config.diagnostics
         self.input = InputTask(time.monotonic(), source)
         self.processing = ProcessingTask()
         self._newest: Segmentation | None = None  # its statistics are computed for a report only
-        self._node, self._limits, self._level = node, limits, config.frame.level
+        self._node, self._config = node, config
         self._n_logged = '0'
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._timer = node.create_timer(limits.period, self._publish, clock=STEADY_CLOCK)
+        period = config.diagnostics.period
+        self._timer = node.create_timer(period, self._publish, clock=STEADY_CLOCK)
 
     def configure(self, config: Config) -> None:
         """Use `config` from now on; with another period, the next report comes after it."""
-        limits, self._level = config.diagnostics, config.frame.level
-        if limits.period != self._limits.period:
-            self._timer.timer_period_ns = round(1e9 * limits.period)
+        period, before = config.diagnostics.period, self._config.diagnostics.period
+        self._config = config
+        if period != before:
+            self._timer.timer_period_ns = round(1e9 * period)
             self._timer.reset()
-        self._limits = limits
 
     def arrived(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
         """Count a cloud that came at the time `arrival` [s], and `n_lost` before it."""
@@ -295,9 +294,8 @@ class Diagnostics:
     ) -> None:
         """Count the cloud that came at `arrival` [s], as in `processed`; log its stages."""
         logger, backend = self._node.get_logger(), scan.fit.backend
-        if logger.is_enabled_for(LoggingSeverity.DEBUG):
-            times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
-            logger.debug(f'times of the stages [ms]: {times}')
+        times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
+        logger.debug(f'times of the stages [ms]: {times}')
         if self._newest is None:
             logger.info(
                 f'first cloud: frame {self.input.frame!r}, {len(scan.label)} points, sensor '
@@ -314,10 +312,11 @@ class Diagnostics:
     def _report(self) -> list[Status]:
         """Return the status of each task; log that the node works, if it does."""
         now, ros_time = time.monotonic(), 1e-9 * self._node.get_clock().now().nanoseconds
+        limits = self._config.diagnostics
         found = [
-            self.input.report(now, ros_time, self._limits),
-            self.processing.report(self._limits),
-            model_status(self._newest, self._level),
+            self.input.report(now, ros_time, limits),
+            self.processing.report(limits),
+            model_status(self._newest, self._config.frame.level),
         ]
         values = {name: text for status in found for name, text in status.values.items()}
         if (n := values['Clouds since startup']) != self._n_logged:
