@@ -287,9 +287,11 @@ def test_stamps_of_another_clock_are_a_warning(b, off, said):
 
 def test_what_the_library_says_of_a_cloud_its_node_says(b, tmp_path):
     """Not the other nodes of the process."""
-    silent = ros.GroundSegmentationNode(context=b.node.context, namespace='/silent')
+    words = '--ros-args', *ros.given({'runtime.backend': 'numpy'})
+    silent = ros.GroundSegmentationNode(
+        context=b.node.context, namespace='/silent', cli_args=words
+    )
     with ros.stderr_in(tmp_path) as said:
-        b.in_executor(silent._make_segmenter)
         assert not b.set('sensor.height', 5.0)
         b.segment(to_message(street(3000)))
         log = said('is sensor.height right')
