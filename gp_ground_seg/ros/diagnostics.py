@@ -14,7 +14,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.core.parameters.config import DiagnosticsConfig
+from gp_ground_seg.core.parameters.config import Config, DiagnosticsConfig
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.ros.input import STEADY_CLOCK, CloudSubscription, seconds_of
@@ -22,6 +22,14 @@ from gp_ground_seg.ros.input import STEADY_CLOCK, CloudSubscription, seconds_of
 RATE_WINDOW = 10.0  # time over which the rate is taken [s]
 LOG_PERIOD = 60.0  # time between two lines of the log on the clouds so far [s]
 CLOUD_WINDOW = 100  # clouds over which the median of the latency is taken
+MAX_AGE = 0.05  # time between a cloud and a transform from which on TF is called late [s]
+SLOW = {
+    'queue': 'waiting for its turn',
+    'frames': 'waiting for TF or IMU',
+    'total': 'segmentation with {}',
+    'publish': 'publishing, as when a subscriber is slow',
+}
+"""Stages of a cloud, as they are named when they take long."""
 Level = IntEnum('Level', 'OK WARN ERROR STALE', start=0)
 """Severity, with the values of ``diagnostic_msgs/DiagnosticStatus``."""
 
@@ -47,11 +55,11 @@ class InputTask:
         self._source = source
         self._last_arrival = self._listening_since = now
         self._arrivals: deque[float] = deque()  # of the last `RATE_WINDOW`
-        self._n_arrived = self._n_refused = self._n_time_jumps = 0
+        self._n_arrived = self.n_refused = self._n_time_jumps = 0
         # Clouds of the newest reporting period that had any.
         self._n_recent = self._n_refused_recent = 0
         self._is_reported = True
-        self._frame = self._fields = self._last_error = ''
+        self.frame = self._fields = self._last_error = ''
         self._stamp: float | None = None
 
     def arrived(self, now: float, cloud: PointCloud2) -> None:
@@ -63,13 +71,13 @@ class InputTask:
         self._last_arrival = now
         self._n_arrived += 1
         self._arrivals.append(now)
-        self._stamp, self._frame = seconds_of(cloud.header.stamp), cloud.header.frame_id
+        self._stamp, self.frame = seconds_of(cloud.header.stamp), cloud.header.frame_id
         self._fields = ' '.join(field.name for field in cloud.fields)
 
     def refused(self, reason: str) -> None:
         """Count the cloud that arrived last as one that could not be processed."""
         self._n_refused_recent += 1
-        self._n_refused += 1
+        self.n_refused += 1
         self._last_error = reason
 
     def time_jumped(self) -> None:
@@ -100,9 +108,9 @@ class InputTask:
             'Time since last cloud (s)': f'{now - self._last_arrival:.3f}',
             'Age of last stamp (s)': _digits(age, '.3f'),
             'Time jumps since startup': str(self._n_time_jumps),
-            'Frame': self._frame,
+            'Frame': self.frame,
             'Fields': self._fields,
-            'Refused since startup': str(self._n_refused),
+            'Refused since startup': str(self.n_refused),
             'Last error': self._last_error,
         }
         return Status('input', *self._judge(now, limits.stale_after), values)
@@ -121,7 +129,6 @@ class InputTask:
             every = n_refused == n_received
             share = 'every cloud' if every else f'{n_refused} of {n_received} clouds'
             return Level.ERROR, f'{share} refused: {self._last_error}'
-        # A stamp may be of any age: a recording is played at any time.
         if source.fault:
             return Level.WARN, source.fault
         waiting = f'waiting for the first cloud on {source.topic}'
@@ -132,24 +139,32 @@ class ProcessingTask:
     """Latency and losses."""
 
     def __init__(self) -> None:
-        # Of the newest clouds, from arrival to publication [s].
+        # Of the newest clouds, from arrival to publication, and of each stage in `SLOW` [s].
         self._latencies: deque[float] = deque(maxlen=CLOUD_WINDOW)
-        self._n_processed = self._n_dropped = 0
+        self._stages: deque[list[float]] = deque(maxlen=CLOUD_WINDOW)
+        self.n_processed = self.n_dropped = 0
         # Since the last report.
         self._n_sent_recent = self._n_dropped_recent = 0
         self._backend = ''
+        self._age: float | None = None
 
     def arrived(self, n_lost: int) -> None:
         """Count a cloud that arrived, and `n_lost` before it that did not."""
         self._n_sent_recent += 1 + n_lost
-        self._n_dropped += n_lost
+        self.n_dropped += n_lost
         self._n_dropped_recent += n_lost
 
-    def processed(self, latency: float, backend: str) -> None:
-        """Count a cloud that was published `latency` [s] after it arrived."""
-        self._n_processed += 1
+    def processed(
+        self, latency: float, backend: str, stages: Mapping[str, float], age: float | None
+    ) -> None:
+        """Count a cloud that was published `latency` [s] after it arrived.
+
+        `age` is how far the pose by TF or an IMU is from its stamp [s], None without these.
+        """
+        self.n_processed += 1
         self._latencies.append(latency)
-        self._backend = backend
+        self._stages.append([stages[name] for name in SLOW])
+        self._backend, self._age = backend, age
 
     def report(self, limits: DiagnosticsConfig) -> Status:
         """Judge the latest clouds, and the losses since the last report."""
@@ -157,7 +172,17 @@ class ProcessingTask:
         limit, n_dropped = 1e3 * limits.max_latency, self._n_dropped_recent
         faults = []
         if latency is not None and latency > limit:
-            faults.append(f'median latency {latency:.0f} ms, above {limit:g} ms')
+            times = zip(1e3 * np.median(self._stages, axis=0), SLOW.values(), strict=True)
+            longest, stage = max(times)
+            faults.append(
+                f'median latency {latency:.0f} ms, above {limit:g} ms, of it {longest:.0f} ms '
+                f'{stage.format(self._backend)}'
+            )
+        if self._age is not None and self._age > MAX_AGE:
+            faults.append(
+                f'the pose by TF or IMU is {self._age:.2f} s from the stamp of the newest cloud: '
+                'what sends it is late, or has another clock'
+            )
         if n_dropped:
             faults.append(
                 f'{n_dropped} of {self._n_sent_recent} clouds dropped since the last report'
@@ -165,16 +190,23 @@ class ProcessingTask:
         self._n_sent_recent = self._n_dropped_recent = 0
         good = 'no cloud processed yet' if latency is None else f'median latency {latency:.1f} ms'
         values = {
-            'Clouds since startup': str(self._n_processed),
-            'Dropped since startup': str(self._n_dropped),
+            'Clouds since startup': str(self.n_processed),
+            'Dropped since startup': str(self.n_dropped),
             'Median latency (ms)': _digits(latency, '.2f'),
             'Backend': self._backend,
+            'Age of transform (s)': _digits(self._age, '.3f'),
         }
         return judged('processing', faults, good, values)
 
 
-def model_status(scan: Segmentation | None) -> Status:
-    """Judge the newest scan."""
+def by_what_was_set(fault: str, level: str) -> str:
+    """Return a fault of the tilt under the value of ``frame.level``, where that has given it."""
+    is_given = level != 'sensor' and fault.startswith(('sensor.roll', 'sensor.pitch'))
+    return f'frame.level = {level}, which gives {fault}' if is_given else fault
+
+
+def model_status(scan: Segmentation | None, level: str = 'sensor') -> Status:
+    """Judge the newest scan, whose tilt is by the `level` of ``frame.level``."""
     if scan is None:
         return Status('model', Level.OK, 'no cloud segmented yet', {})
     fit, label = scan.fit, scan.label
@@ -192,7 +224,8 @@ def model_status(scan: Segmentation | None) -> Status:
         'Optimiser status': fit.status,
         **{f'theta {name}': f'{value:.4g}' for name, value in fit.theta.items()},
     }
-    return judged('model', _faults_of(scan), 'ground found in the newest cloud', values)
+    faults = [by_what_was_set(fault, level) for fault in _faults_of(scan)]
+    return judged('model', faults, 'ground found in the newest cloud', values)
 
 
 def _faults_of(scan: Segmentation) -> list[str]:
@@ -233,41 +266,57 @@ def _pose_values(pose: SensorPose) -> dict[str, str]:
 class Diagnostics:
     """The three tasks of `node`, published every ``diagnostics.period``."""
 
-    def __init__(self, node: Node, source: CloudSubscription, limits: DiagnosticsConfig) -> None:
+    def __init__(self, node: Node, source: CloudSubscription, config: Config) -> None:
         self.input = InputTask(time.monotonic(), source)
         self.processing = ProcessingTask()
         self._newest: Segmentation | None = None  # its statistics are computed for a report only
-        self._node, self._limits = node, limits
+        self._node, self._config = node, config
         self._n_logged = '0'
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._timer = node.create_timer(limits.period, self._publish, clock=STEADY_CLOCK)
+        period = config.diagnostics.period
+        self._timer = node.create_timer(period, self._publish, clock=STEADY_CLOCK)
 
-    def configure(self, limits: DiagnosticsConfig) -> None:
-        """Use `limits` from now on; with another period, the next report comes after it."""
-        if limits.period != self._limits.period:
-            self._timer.timer_period_ns = round(1e9 * limits.period)
+    def configure(self, config: Config) -> None:
+        """Use `config` from now on; with another period, the next report comes after it."""
+        period, before = config.diagnostics.period, self._config.diagnostics.period
+        self._config = config
+        if period != before:
+            self._timer.timer_period_ns = round(1e9 * period)
             self._timer.reset()
-        self._limits = limits
 
     def arrived(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
         """Count a cloud that came at the time `arrival` [s], and `n_lost` before it."""
         self.input.arrived(arrival, cloud)
         self.processing.arrived(n_lost)
 
-    def published(self, scan: Segmentation, arrival: float, stages: Mapping[str, float]) -> None:
-        """Count the cloud that came at the time `arrival` [s]; log the times of its stages."""
+    def published(
+        self, scan: Segmentation, arrival: float, stages: Mapping[str, float], age: float | None
+    ) -> None:
+        """Count the cloud that came at `arrival` [s], as in `processed`; log its stages."""
+        logger, backend = self._node.get_logger(), scan.fit.backend
         times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
-        self._node.get_logger().debug(f'times of the stages [ms]: {times}')
-        self.processing.processed(time.monotonic() - arrival, scan.fit.backend)
+        logger.debug(f'times of the stages [ms]: {times}')
+        if self._newest is None:
+            logger.info(
+                f'first cloud: frame {self.input.frame!r}, {len(scan.label)} points, sensor '
+                f'{scan.pose.sensor_height:.2f} m over the ground, segmented with {backend}'
+            )
+        self.processing.processed(time.monotonic() - arrival, backend, stages, age)
         self._newest = scan
+
+    def summary(self) -> str:
+        """Return what became of the clouds so far."""
+        n_done, n_lost = self.processing.n_processed, self.processing.n_dropped
+        return f'ends: {n_done} clouds segmented, {n_lost} lost, {self.input.n_refused} refused'
 
     def _report(self) -> list[Status]:
         """Return the status of each task; log that the node works, if it does."""
         now, ros_time = time.monotonic(), 1e-9 * self._node.get_clock().now().nanoseconds
+        limits = self._config.diagnostics
         found = [
-            self.input.report(now, ros_time, self._limits),
-            self.processing.report(self._limits),
-            model_status(self._newest),
+            self.input.report(now, ros_time, limits),
+            self.processing.report(limits),
+            model_status(self._newest, self._config.frame.level),
         ]
         values = {name: text for status in found for name, text in status.values.items()}
         if (n := values['Clouds since startup']) != self._n_logged:

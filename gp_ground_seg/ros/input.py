@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
+from statistics import median
 from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
@@ -28,6 +30,8 @@ JUMP_TOLERANCE = 0.5  # stamps of several sensors on a topic may be so far out o
 NOTHING_ARRIVES = (
     'qos_overrides asks for reliable, and a publisher offers best effort: nothing arrives from it'
 )
+AGE_WINDOW = 10  # clouds over which the median of their age is taken
+MAX_AGE = 1.0  # age of a cloud when it is sent from which on its stamp is of another clock [s]
 NO_TIME = (
     'use_sim_time is true, and no time has come on /clock: start what publishes it, or set '
     'use_sim_time to false'
@@ -121,6 +125,8 @@ class CloudSubscription:
         self._why_idle = why_idle
         self._jumps = TimeJumps(node, on_jump)
         self._gaps = SequenceGaps()
+        # How old the stamps of the newest clouds were when these were sent [s].
+        self._ages: deque[float] = deque(maxlen=AGE_WINDOW)
         self._offered: dict[bytes, ReliabilityPolicy] = {}
         self._foreign: set[str] = set()  # types of other messages that are sent on the topic
         self._unresolved_topic = topic
@@ -152,7 +158,19 @@ class CloudSubscription:
         is_refused = ReliabilityPolicy.BEST_EFFORT in self._offered.values()
         is_pinned = self._is_pinned and self._reliability == ReliabilityPolicy.RELIABLE
         other = NOTHING_ARRIVES if is_pinned and is_refused else self._fault_of_size
-        return '; '.join(filter(None, (self._fault_of_types, other, self._fault_of_clock)))
+        found = (self._fault_of_types, other, self._fault_of_clock, self._fault_of_stamps)
+        return '; '.join(filter(None, found))
+
+    @property
+    def _fault_of_stamps(self) -> str:
+        age = median(self._ages) if self._ages else 0.0
+        if abs(age) <= MAX_AGE:
+            return ''
+        cure = 'set the timestamp mode of the driver, or use_sim_time for a recording'
+        if self._node.get_clock().ros_time_is_active:
+            cure = 'use_sim_time is true, and the time on /clock is not that of the clouds'
+        side = 'before' if age > 0.0 else 'after'
+        return f'stamps are of another clock, {abs(age):.1f} s {side} the clouds are sent: {cure}'
 
     def _receive(self, cloud: PointCloud2, info: dict[str, Any]) -> None:
         if not self._offered:
@@ -168,8 +186,11 @@ class CloudSubscription:
             )
             self._node.get_logger().warning(f'on {self.topic}, {self._fault_of_size}', once=True)
         self._jumps.note(seconds_of(cloud.header.stamp))
-        # Both are stamps of the system clock; 0 where the middleware gives none.
+        # All are stamps of the system clock; 0 where the middleware gives none.
         now = time.time_ns()
+        if ros_now := self._node.get_clock().now().nanoseconds:
+            sent = ros_now - now + (info.get('source_timestamp') or now)
+            self._ages.append(1e-9 * sent - seconds_of(cloud.header.stamp))
         wait = max(0.0, 1e-9 * (now - (info.get('received_timestamp') or now)))
         self.callback(cloud, time.monotonic() - wait, n_lost)
 
@@ -207,6 +228,8 @@ class CloudSubscription:
         self._fault_of_clock = '' if has_time else NO_TIME
         if not has_time:
             self._node.get_logger().warning(NO_TIME, once=True)
+        if fault := self._fault_of_stamps:
+            self._node.get_logger().warning(f'on {self.topic}, {fault}', once=True)
         self._review_soon.trigger()
 
     def review(self) -> None:

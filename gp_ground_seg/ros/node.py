@@ -10,6 +10,7 @@ import time
 import uuid
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from contextvars import ContextVar
 from functools import partial
 from typing import Any
 
@@ -35,7 +36,7 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.ros.arguments import initialize, start_errors, unused_files, with_file
-from gp_ground_seg.ros.diagnostics import Diagnostics, kept_height
+from gp_ground_seg.ros.diagnostics import Diagnostics, by_what_was_set, kept_height
 from gp_ground_seg.ros.input import STEADY_CLOCK, THROTTLED, CloudSubscription
 from gp_ground_seg.ros.loader import CHANGED, FOLLOWS, STAYS, BackendLoader
 from gp_ground_seg.ros.outputs import OutputPublishers
@@ -60,6 +61,8 @@ NO_BOND = (
     'package bond is not installed (apt install ros-jazzy-bond): set bond_timeout: 0.0 on a '
     'lifecycle manager of this node'
 )
+_SPEAKER: ContextVar[Node | None] = ContextVar('speaker', default=None)
+"""The node whose cloud is segmented in this thread: what the library says then is about it."""
 
 
 class GroundSegmentationNode(ConfiguredNode):
@@ -102,7 +105,7 @@ class GroundSegmentationNode(ConfiguredNode):
                 self, 'points', self._on_cloud, self._why_idle, self._on_time_jump
             )
         self._follow_frames(self.config)
-        self._diagnostics = Diagnostics(self, self._input, self.config.diagnostics)
+        self._diagnostics = Diagnostics(self, self._input, self.config)
         self.warn_of_unused_parameters()
         self._load_backend(self.config)
         self._input.review()
@@ -114,6 +117,7 @@ class GroundSegmentationNode(ConfiguredNode):
         """
         if self._input.idle:
             return  # it has waited for TF or IMU, and is not wanted any more
+        _SPEAKER.set(self)
         start, header = time.monotonic(), cloud.header
         self._diagnostics.arrived(cloud, arrival, n_lost)
         try:
@@ -133,9 +137,10 @@ class GroundSegmentationNode(ConfiguredNode):
             # The next cloud may be good.
             self._refuse(cloud, error)
             return
-        publishing = time.monotonic() - segmented
-        stages = {'queue': start - arrival, **result.timings, 'publish': publishing}
-        self._diagnostics.published(result, arrival, stages)
+        publishing, waited = time.monotonic() - segmented, frames.waited
+        before = {'queue': start - arrival - waited, 'frames': waited}
+        stages = {**before, **result.timings, 'publish': publishing}
+        self._diagnostics.published(result, arrival, stages, frames.age)
 
     def _why_idle(self) -> str:
         """Why no clouds are wanted now; empty if they are."""
@@ -161,14 +166,18 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def apply_config(self, config: Config) -> None:
         """Use `config` from the next cloud on; compiled code as soon as that is made."""
+        _SPEAKER.set(self)
         self._load_backend(config)
         runtime = config.runtime if self._is_compiled else self._segmenter.config.runtime
         self._segmenter.configure(dataclasses.replace(config, runtime=runtime))
         self._kept.forget()
         self._follow_frames(config)
-        self._diagnostics.configure(config.diagnostics)
+        self._diagnostics.configure(config)
 
     def _pass_on(self, level: int, message: str) -> None:
+        if _SPEAKER.get() not in (None, self):
+            return  # it is about a cloud of another node in this process
+        message = by_what_was_set(message, self.config.frame.level)
         # rclpy wants a line of code for each severity.
         if level >= logging.WARNING:
             self.get_logger().warning(message)
@@ -222,17 +231,16 @@ class GroundSegmentationNode(ConfiguredNode):
 class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[misc]
     """A `GroundSegmentationNode` that begins and ends with the transitions of ROS.
 
-    *configure* makes the compiled backend and waits for it; *activate* subscribes, and begins the
-    bond that Nav2's lifecycle manager waits for; *deactivate* ends both; *cleanup*, *shutdown* and
-    an error free the backend. Parameters can be set in every state. Options are those of
-    `rclpy.node.Node`.
+    *configure* begins to make the compiled backend: for half a minute *active* may mean numpy.
+    *activate* subscribes, and begins the bond that Nav2's lifecycle manager waits for;
+    *deactivate* ends both; *cleanup*, *shutdown* and an error free the backend. Parameters can be
+    set in every state. Options are those of `rclpy.node.Node`.
     """
 
     _is_configured = _is_active = False
     _heartbeat: Heartbeat | None = None
 
-    def __init__(self, stop: StopRequest, **options: Any) -> None:
-        self._stop = stop
+    def __init__(self, **options: Any) -> None:
         GroundSegmentationNode.__init__(self, **options)
         LifecycleNodeMixin.__init__(self)
         # At an impossible transition rclpy's own callback raises, and the caller gets no answer.
@@ -259,14 +267,9 @@ class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[m
         return super()._why_idle() if self._is_active else 'the node is not active'
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
-        """Make the compiled backend; fail if the process is asked to end meanwhile."""
+        """Begin to make the compiled backend."""
         self._is_configured = True
         self._load_backend(self.config)
-        while self._loader.is_busy:
-            if self._stop.made:
-                return TransitionCallbackReturn.FAILURE
-            time.sleep(0.02)
-        self._change_backend()
         return TransitionCallbackReturn.SUCCESS
 
     def _set_active(self, is_active: bool) -> TransitionCallbackReturn:
@@ -339,8 +342,9 @@ def _spin(node: GroundSegmentationNode, stop: StopRequest) -> None:
     executor.add_node(node)
     while rclpy.ok() and not stop.made:
         try:
-            # Python handles a signal after the wait, not within it.
-            executor.spin_once(timeout_sec=0.1)
+            # Python handles a signal after the wait, not within it. A wait of less than the time
+            # between two clouds would end in vain before each.
+            executor.spin_once(timeout_sec=0.25)
         except ExternalShutdownException:
             return
         except Exception as error:
@@ -359,10 +363,11 @@ def main(args: Sequence[str] | None = None, *, is_managed: bool = False) -> int:
             # Both outputs at once are more than stock Fast DDS sends without loss.
             with large_cloud_transport():
                 initialize(words)
-                node = ManagedNode(stop) if is_managed else GroundSegmentationNode()
+                node = ManagedNode() if is_managed else GroundSegmentationNode()
             for line in unused_files(words, node.get_fully_qualified_name()):
                 node.get_logger().warning(line)
             _spin(node, stop)
+            node.get_logger().info(node._diagnostics.summary())
         except GroundSegError as error:
             problem = with_file(str(error), words)
             sys.stderr.write(f'{NODE_NAME}: error: {shown(problem)}\n')

@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
+from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 
@@ -42,6 +44,7 @@ MODEL_FIELDS = (
 horizontal range of the knot in the level frame, and, equal in all points, the angles that turn the
 cloud's frame into the level one, and the place of the sensor in it."""
 OUTPUT_DEPTH = 20  # messages kept: Fast DDS may send a lost fragment again after 0.7 s only
+MAP_LIFESPAN = 0.9  # a grid for a reader that comes later has been sent so long ago at most [s]
 LONGEST_PERIOD = 1.0
 """Time between two clouds [s] from which on some are missing: ``scan_time`` is 0 then."""
 
@@ -53,6 +56,7 @@ class Output(NamedTuple):
     message_type: type
     build: Callable[[SegmentedCloud], Any]
     is_optional: bool  # built only while it has a subscriber
+    profile: QoSProfile = QoSProfile(depth=OUTPUT_DEPTH)
 
 
 def labelled_cloud(segmented: SegmentedCloud) -> PointCloud2:
@@ -160,13 +164,19 @@ def _selected(segmented: SegmentedCloud, chosen: BoolArray) -> PointCloud2:
     return select_points(segmented.cloud, chosen, message_bytes, are_finite=True)
 
 
+# Readers of maps are transient local, or not; DDS keeps no old one for those.
+_OF_MAPS = QoSProfile(
+    depth=OUTPUT_DEPTH,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    lifespan=Duration(seconds=MAP_LIFESPAN),
+)
 OUTPUTS = (
     Output('ground', PointCloud2, lambda s: _selected(s, s.is_ground), False),
     Output('obstacles', PointCloud2, lambda s: _selected(s, s.is_obstacle), False),
     Output('~/labeled', PointCloud2, labelled_cloud, True),
     Output('~/ground_model', PointCloud2, ground_model_cloud, True),
     Output('~/scan', LaserScan, scan, True),
-    Output('~/occupancy', OccupancyGrid, occupancy_grid, True),
+    Output('~/occupancy', OccupancyGrid, occupancy_grid, True, _OF_MAPS),
 )
 
 
@@ -178,7 +188,7 @@ class OutputPublishers:
     def __init__(self, node: Node) -> None:
         options = {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
         self._publishers = [
-            (o, node.create_publisher(o.message_type, o.topic, OUTPUT_DEPTH, **options))
+            (o, node.create_publisher(o.message_type, o.topic, o.profile, **options))
             for o in OUTPUTS
         ]
 

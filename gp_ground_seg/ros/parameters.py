@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterable
 from typing import Any
 
@@ -46,7 +47,12 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
 
 def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
     """Return `config` with those of the `parameters` that it declares, if they are accepted."""
-    values = {given.name: given.value for given in parameters if given.name in _NAMES}
+    # Of a list ROS makes an array, which an error would show as such.
+    values = {
+        given.name: list(given.value) if isinstance(given.value, array) else given.value
+        for given in parameters
+        if given.name in _NAMES
+    }
     return config.replace(**values)
 
 

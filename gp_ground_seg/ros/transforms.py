@@ -7,17 +7,19 @@ import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import Quaternion
+from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
 from sensor_msgs.msg import Imu, PointCloud2
 from std_msgs.msg import Header
 
-from gp_ground_seg.core.errors import MissingDependencyError, PointCloudError
+from gp_ground_seg.core.errors import ConfigError, MissingDependencyError, PointCloudError
 from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.core.parameters.config import NO_FRAME, Config
 from gp_ground_seg.core.pipeline.points import angles_of
@@ -26,9 +28,13 @@ from gp_ground_seg.ros.input import STEADY_CLOCK, OnCloud, seconds_of
 
 KEPT_JUMP = 1.0  # after a longer jump back in time, transforms are forgotten [s]
 MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]
+LONGEST_WAIT = 1.0  # the same, where it would be refused, and older messages still come [s]
 REVIEW_PERIOD = 0.005  # time between two checks of whether they have come [s]
 IMU_TOLERANCE = 0.05  # longest time between a cloud and its orientation [s]
-IMU_DEPTH = 400  # messages kept: those of 0.4 s at 1 kHz
+DEPTH = 1000  # messages kept: those of 1 s at 1 kHz
+BEST_EFFORT = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+RELIABLE = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 INSTALL_TF2 = 'sudo apt install ros-jazzy-tf2-ros-py'
 
 
@@ -41,9 +47,13 @@ def find_module(name: str) -> Any:
 
 
 def check_tf2(config: Config) -> None:
-    """Raise a MissingDependencyError if `config` asks for TF and tf2_ros is not installed."""
+    """Raise a GroundSegError if TF is asked for, and is not installed or refuses a name."""
+    frame = config.frame
+    for name in ('base', 'sensor'):
+        given = getattr(frame, name)
+        if given.startswith('/'):
+            raise ConfigError(f'frame.{name} = {given!r}: must not begin with /, as tf2 wants')
     if is_tf_used(config) and find_module('tf2_ros') is None:
-        frame = config.frame
         asked = 'level = tf' if frame.level == 'tf' else f'sensor = {frame.sensor}'
         raise MissingDependencyError(
             f'frame.{asked}: needs tf2_ros, which cannot be imported: {INSTALL_TF2}'
@@ -89,104 +99,148 @@ class CloudFrames(NamedTuple):
     origin: tuple[float, float, float] | None = None  # place of the sensor in it [m]
     # rotation (3, 3) and translation (3,) [m] into ``frame.base``
     base: tuple[FloatArray, FloatArray] | None = None
+    age: float | None = None  # longest time from the cloud to a transform or orientation [s]
+    waited: float = 0.0  # how long the cloud was held [s]
+
+
+class Unattended(CallbackGroup):  # type: ignore[misc]
+    """Keeps subscriptions from the executor, which spends 0.3 ms on a message, and their events.
+
+    Data that nobody takes would wake it all the time.
+    """
+
+    def can_execute(self, _entity: object) -> bool:
+        """Return whether the executor may wait for an entity: never."""
+        return False
 
 
 class ImuListener:
-    """Listens to ``imu`` in the executor of `node`."""
+    """Keeps what ``imu`` has sent."""
 
     def __init__(self, node: Node) -> None:
-        self._node = node
-        self._messages: deque[Imu] = deque(maxlen=IMU_DEPTH)
-        # Best effort, which takes from any publisher.
-        profile = QoSProfile(depth=IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._subscription = node.create_subscription(Imu, 'imu', self._take, profile)
-        self.topic: str = self._subscription.topic_name
+        self.topic: str = node.resolve_topic_name('imu')
+        self._messages: deque[tuple[float, Imu]] = deque(maxlen=DEPTH)  # with their stamps [s]
 
-    def _take(self, message: Imu) -> None:
-        self._messages.append(message)
+    def take(self, message: Imu) -> float:
+        """Keep a message; return its stamp [s]."""
+        stamp = seconds_of(message.header.stamp)
+        self._messages.append((stamp, message))
+        return stamp
 
-    def reaches(self, header: Header) -> bool:
-        """Return whether it has sent something as new as a cloud."""
-        newest = [seconds_of(message.header.stamp) for message in self._messages][-1:]
-        return bool(newest) and newest[0] >= seconds_of(header.stamp)
+    def reaches(self, stamp: float) -> bool:
+        """Return whether it has sent something as new as a cloud of that `stamp` [s]."""
+        return bool(self._messages) and self._messages[-1][0] >= stamp
 
-    def at(self, header: Header) -> Imu:
-        """Return the message nearest in time to a cloud; raise a PointCloudError without one."""
-        stamp = seconds_of(header.stamp)
-        off = [abs(seconds_of(message.header.stamp) - stamp) for message in self._messages]
-        if not off:
+    def at(self, stamp: float) -> tuple[Imu, float]:
+        """Return the message nearest to the `stamp` of a cloud, and how far that is off [s].
+
+        Raises a PointCloudError without one that is near.
+        """
+        if not self._messages:
             raise PointCloudError(f'no message on {self.topic}, for frame.level = imu')
-        if min(off) > IMU_TOLERANCE:
+        off, found = min(((abs(t - stamp), m) for t, m in self._messages), key=itemgetter(0))
+        if off > IMU_TOLERANCE:
             raise PointCloudError(
-                f'the nearest orientation on {self.topic} is {min(off):.3g} s from its stamp: '
+                f'the nearest orientation on {self.topic} is {off:.3g} s from its stamp: '
                 f'must be within {IMU_TOLERANCE:g} s'
             )
-        found = self._messages[off.index(min(off))]
         if found.orientation_covariance[0] == -1.0:
             raise PointCloudError(
                 f'{self.topic} has no orientation (orientation_covariance[0] is -1): remap imu to '
                 'the output of a filter, such as imu_filter_madgwick'
             )
-        return found
+        return found, off
 
-    def close(self) -> None:
-        """Stop listening."""
-        self._node.destroy_subscription(self._subscription)
+
+def keep_transforms(keep: Callable[[Any, str], None], message: Any) -> float:
+    """Pass what TF has sent in a `message` to `keep`; return the newest stamp in it [s]."""
+    for transform in message.transforms:
+        keep(transform, 'default_authority')
+    return max((seconds_of(t.header.stamp) for t in message.transforms), default=0.0)
 
 
 class FrameListener:
-    """Listens to TF and to an IMU, as `config` asks, in the executor of `node`.
+    """Listens to TF and to an IMU, as `config` asks.
 
     `hold` takes clouds and passes them to `use` in their order: each as soon as transform and
-    orientation at its stamp are known, or after `MAX_WAIT`. It does not block: the messages of TF
-    and IMU come to the same executor.
+    orientation at its stamp are known, or after `MAX_WAIT`. One that would be refused then waits
+    on, up to `LONGEST_WAIT`, while older messages still come: the node is behind, or their sender.
+    It does not block. What TF and IMU have sent is taken when a cloud comes or waits.
     """
 
     def __init__(self, node: Node, config: Config, use: OnCloud) -> None:
         self.config = config
-        self._imu = ImuListener(node) if config.frame.level == 'imu' else None
-        self._tf2_ros = find_module('tf2_ros')
+        self._node, self._use = node, use
+        self._news: dict[str, tuple[float, float]] = {}  # newest stamp and its arrival [s]
+        self._imu = self._buffer = None
         self._not_yet: Any = ()  # what TF raises
         self._too_late: Any = ()
-        if self._tf2_ros is not None:
-            self._not_yet = self._tf2_ros.TransformException
-            self._too_late = self._tf2_ros.ExtrapolationException
+        sources: list[tuple[Any, str, Callable[[Any], float], QoSProfile]] = []
+        if config.frame.level == 'imu':
+            self._imu = ImuListener(node)
+            sources += [(Imu, 'imu', self._imu.take, BEST_EFFORT)]  # takes from any publisher
+        if (tf2 := find_module('tf2_ros')) is not None:
+            self._not_yet, self._too_late = tf2.TransformException, tf2.ExtrapolationException
             # Without the node: given one, the buffer clears itself at jumps of the node's clock,
             # and in some releases raises an error there that ends the executor. See `time_jumped`.
-            self._buffer = self._tf2_ros.Buffer()
-            self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
+            self._buffer = tf2.Buffer()
+            kind = find_module('tf2_msgs.msg').TFMessage
+            keep = partial(keep_transforms, self._buffer.set_transform)
+            keep_static = partial(keep_transforms, self._buffer.set_transform_static)
+            sources += [(kind, '/tf', keep, RELIABLE), (kind, '/tf_static', keep_static, LATCHED)]
+        group = Unattended()
+        self._subscriptions = [
+            node.create_subscription(*source, callback_group=group) for source in sources
+        ]
         self._waiting: deque[tuple[float, Header, Callable[[], None]]] = deque()
-        self._node, self._use = node, use
+        self._held = 0.0  # how long the cloud that is used now was held [s]
         self._timer = node.create_timer(REVIEW_PERIOD, self._review, clock=STEADY_CLOCK)
         self._timer.cancel()
 
     def hold(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
         """Keep a cloud until its transform and orientation are known."""
         use = partial(self._use, cloud, arrival, n_lost)
-        self._waiting.append((time.monotonic() + MAX_WAIT, cloud.header, use))
+        self._waiting.append((time.monotonic(), cloud.header, use))
         self._review()
 
+    def _take_all(self) -> None:
+        """Take all that TF and IMU have sent."""
+        for source in self._subscriptions:
+            with source.handle:
+                while (taken := source.handle.take_message(source.msg_type, False)) is not None:
+                    newest = source.callback(taken[0])
+                    self._news[source.topic_name] = newest, time.monotonic()
+
     def _review(self) -> None:
+        self._take_all()
         while self._waiting:
-            deadline, header, use = self._waiting[0]
-            if time.monotonic() < deadline and not self._is_known(header):
+            since, header, use = self._waiting[0]
+            if self._has_to_wait(header, since):
                 self._timer.reset()
                 return
             self._waiting.popleft()
+            self._held = time.monotonic() - since
             use()
         self._timer.cancel()
 
-    def _is_known(self, header: Header) -> bool:
-        """Return whether `look_up` need not wait: all is known at the stamp, or it raises."""
-        if self._imu is not None and not self._imu.reaches(header):
-            return False
+    def _has_to_wait(self, header: Header, since: float) -> bool:
+        """Return whether the pose at the stamp of a cloud, held `since` then, may still come."""
+        stamp, waited = seconds_of(header.stamp), time.monotonic() - since
+        is_early = waited < MAX_WAIT
+        if is_early and self._imu is not None and not self._imu.reaches(stamp):
+            return True
         try:
-            self.look_up(header, is_exact=True)
+            self.look_up(header, is_exact=is_early)
         except self._not_yet:
-            return False
-        except (PointCloudError, ValueError):
-            return True  # the cloud is refused with the reason
-        return True
+            return True
+        except (PointCloudError, ValueError):  # the cloud is refused with the reason
+            return MAX_WAIT <= waited < LONGEST_WAIT and self._is_behind(stamp)
+        return False
+
+    def _is_behind(self, stamp: float) -> bool:
+        """Return whether messages that are older than the `stamp` of a cloud [s] still come."""
+        soon = time.monotonic() - MAX_WAIT
+        return any(newest < stamp and came > soon for newest, came in self._news.values())
 
     def look_up(self, header: Header, is_exact: bool = False) -> CloudFrames:
         """Return tilt and place of the sensor at the stamp of a cloud, as the parameters ask.
@@ -194,55 +248,58 @@ class FrameListener:
         If TF does not reach the stamp, its newest transform is used, unless it `is_exact`. Raises
         a PointCloudError if a transform or an orientation is missing.
         """
-        tilt, origin, base = None, None, None
-        transform = self._exact if is_exact else self._newest
-        frame_id, frame = header.frame_id, self.config.frame
+        tilt, origin, base, ages = None, None, None, [0.0]
+        frame_id, frame, stamp = header.frame_id, self.config.frame, seconds_of(header.stamp)
+
+        def transform(target: str, source: str, way: str) -> Any:
+            found = self._look_up(target, source, Time.from_msg(header.stamp), way, is_exact)
+            ages.append(abs(stamp - seconds_of(found.header.stamp)))
+            return found.transform
+
         if frame.level == 'tf':
             way = f'from its frame {frame_id!r} to frame.base = {frame.base!r}'
-            found = transform(frame.base, frame_id, header, way)
+            found = transform(frame.base, frame_id, way)
             base = rotation_of(found.rotation), np.array(_translation_of(found, way))
             tilt = angles_of(base[0][2])
         elif self._imu is not None:
-            message = self._imu.at(header)
+            message, off = self._imu.at(stamp)
+            ages.append(off)
             turn, imu_frame = rotation_of(message.orientation), message.header.frame_id
             if imu_frame != frame_id:
                 way = f'from its frame {frame_id!r} to that of {self._imu.topic}, {imu_frame!r}'
-                turn = turn @ rotation_of(transform(imu_frame, frame_id, header, way).rotation)
+                turn = turn @ rotation_of(transform(imu_frame, frame_id, way).rotation)
             tilt = angles_of(turn[2])
         if frame.sensor != NO_FRAME:
             way = f'from frame.sensor = {frame.sensor!r} to its frame {frame_id!r}'
-            origin = _translation_of(transform(frame_id, frame.sensor, header, way), way)
-        return CloudFrames(tilt, origin, base)
+            origin = _translation_of(transform(frame_id, frame.sensor, way), way)
+        return CloudFrames(tilt, origin, base, max(ages), self._held)
 
-    def _exact(self, target: str, source: str, header: Header, way: str) -> Any:
-        if self._tf2_ros is None:
+    def _look_up(self, target: str, source: str, stamp: Time, way: str, is_exact: bool) -> Any:
+        if self._buffer is None:
             raise PointCloudError(f'transform {way}: needs tf2_ros ({INSTALL_TF2})')
-        stamp = Time.from_msg(header.stamp)
-        return self._buffer.lookup_transform(target, source, stamp).transform
-
-    def _newest(self, target: str, source: str, header: Header, way: str) -> Any:
         try:
-            try:
-                return self._exact(target, source, header, way)
-            except self._too_late:
-                # The newest: a sensor is fixed to its vehicle.
-                return self._buffer.lookup_transform(target, source, Time()).transform
+            return self._buffer.lookup_transform(target, source, stamp)
         except self._not_yet as error:
+            if is_exact:
+                raise
+            if isinstance(error, self._too_late) and stamp.nanoseconds:
+                # The newest: a sensor is fixed to its vehicle.
+                return self._look_up(target, source, Time(), way, is_exact)
             raise PointCloudError(f'no transform {way}: {error}') from error
 
     def time_jumped(self, seconds: float) -> None:
-        """Forget all transforms after a long jump back."""
-        if seconds > KEPT_JUMP and self._tf2_ros is not None:
+        """Forget all transforms after a long jump back, also those that were not taken yet."""
+        self._take_all()
+        self._news.clear()
+        if seconds > KEPT_JUMP and self._buffer is not None:
             self._buffer.clear()
 
     def close(self) -> None:
         """Stop listening; clouds that wait are dropped."""
         self._waiting.clear()
         self._node.destroy_timer(self._timer)
-        if self._tf2_ros is not None:
-            self._listener.unregister()
-        if self._imu is not None:
-            self._imu.close()
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
 
 
 class KeptPose:

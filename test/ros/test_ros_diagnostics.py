@@ -13,6 +13,7 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.parameters.config import DiagnosticsConfig
 from gp_ground_seg.ros.diagnostics import (
     RATE_WINDOW,
+    SLOW,
     InputTask,
     Level,
     ProcessingTask,
@@ -32,10 +33,11 @@ def input_task(now=0.0, **facts):
     return InputTask(now, SimpleNamespace(**{**known, 'fault': '', 'idle': '', **facts}))
 
 
-def process(statistics, latencies):
-    """Clouds that were published so long after their arrival [s]."""
+def process(statistics, latencies, slow='total', age=None):
+    """Clouds that were published so long after their arrival [s], most of it in one stage."""
     for latency in latencies:
-        statistics.processed(latency, 'numba')
+        stages = {**dict.fromkeys(SLOW, 0.1 * latency), slow: 0.8 * latency}
+        statistics.processed(latency, 'numba', stages, age)
     return statistics
 
 
@@ -70,7 +72,7 @@ def test_input_reports_what_it_saw():
         ('Duration of window (s)', '1.000'),
         ('Actual frequency (Hz)', '10.00'),
         ('Time since last cloud (s)', '0.250'),
-        ('Age of last stamp (s)', '0.500'),  # of any age: no fault
+        ('Age of last stamp (s)', '0.500'),
         ('Time jumps since startup', '0'),
         ('Frame', 'velo_link'),
         ('Fields', 'intensity x y z'),
@@ -118,10 +120,19 @@ def test_processing_has_the_median_latency_and_a_slow_one_is_a_warning():
         ('Dropped since startup', '0'),
         ('Median latency (ms)', '50.50'),
         ('Backend', 'numba'),
+        ('Age of transform (s)', 'unknown'),
     ]
     assert (report.level, report.message) == (Level.OK, 'median latency 50.5 ms')
-    report = process(statistics, 60 * [0.2]).report(LIMITS)
-    assert (report.level, report.message) == (Level.WARN, 'median latency 200 ms, above 100 ms')
+    assert process(statistics, 50 * [0.2]).report(LIMITS).level == Level.WARN
+    for stage, name in SLOW.items():
+        report = process(statistics, 100 * [0.2], stage).report(LIMITS)
+        said = f'median latency 200 ms, above 100 ms, of it 160 ms {name.format("numba")}'
+        assert (report.level, report.message) == (Level.WARN, said)
+    # Late TF is said, whatever the latency.
+    for age, level in ((0.04, Level.OK), (0.4, Level.WARN)):
+        report = process(ProcessingTask(), [0.01], age=age).report(LIMITS)
+        assert (report.level, report.values['Age of transform (s)']) == (level, f'{age:.3f}')
+        assert ('by TF or IMU is 0.40 s from the stamp' in report.message) == (age == 0.4)
 
 
 def test_drops_are_a_warning_once_and_counted_for_ever():
@@ -166,6 +177,14 @@ def test_model_reports_the_newest_scan():
         *((f'theta {name}', f'{value:.4g}') for name, value in fit.theta.items()),
     ]
     assert (status.level, status.message) == (Level.OK, 'ground found in the newest cloud')
+
+
+def test_a_tilt_that_the_scan_contradicts_has_the_name_of_what_gave_it():
+    scan = GroundSegmenter().segment(hilly_scan(20_000), (0.4, 0.0))
+    (fault,) = scan.pose.contradictions
+    assert fault.startswith('sensor.roll = 0.4, sensor.pitch = 0: ')
+    for level, said in (('sensor', fault), ('tf', f'frame.level = tf, which gives {fault}')):
+        assert model_status(scan, level).message.startswith(said)
 
 
 NOTHING = 'no ground found in the newest cloud'

@@ -5,6 +5,7 @@ import dataclasses
 import importlib.util
 import math
 import sys
+import threading
 import time
 import types
 
@@ -19,9 +20,10 @@ from rooms import ROOM
 from ros_helpers import bench, street, to_message, wait_for, xyz_of
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
+from std_msgs.msg import Header
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.errors import ConfigError, PointCloudError
 from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.lab.simulation import VLP_16, simulate_scan
 from gp_ground_seg.ros import transforms
@@ -77,14 +79,14 @@ def test_what_is_no_rotation_is_refused(w):
 class StandInBuffer:
     """The part of ``tf2_ros.Buffer`` that is used, with what a test puts in.
 
-    tf2_ros has no wheel, nor have its messages; where it is installed, the last test runs it.
+    tf2_ros has no wheel, nor have its messages; where they are installed, the last test runs them.
     """
 
     def __init__(self):
         self.known = {}  # matrices of rotations
         self.newest = 100  # stamp up to which it knows all [s]
         self.place = 0.0, 0.0, 0.0
-        self.n_cleared = self.n_listeners = 0
+        self.n_cleared = 0
 
     def lookup_transform(self, target, source, time):
         if (target, source) not in self.known:
@@ -93,29 +95,40 @@ class StandInBuffer:
             raise IndexError('would require extrapolation into the future')
         transform = Transform(rotation=quaternion(self.known[target, source]))
         transform.translation.x, transform.translation.y, transform.translation.z = self.place
-        return types.SimpleNamespace(transform=transform)
+        header = Header(stamp=(time if time.nanoseconds else Time(seconds=self.newest)).to_msg())
+        return types.SimpleNamespace(header=header, transform=transform)
 
     def clear(self):
         self.n_cleared += 1
         self.known.clear()
 
-    def listen(self, _buffer, _node, *, spin_thread):
-        assert not spin_thread
-        self.n_listeners += 1
-        return types.SimpleNamespace(unregister=self.unregister)
-
-    def unregister(self):
-        self.n_listeners -= 1
+    set_transform = set_transform_static = None  # nothing is sent
 
 
 @pytest.fixture
 def tf(monkeypatch):
     """What TF knows."""
     buffer = StandInBuffer()
-    parts = {'Buffer': lambda: buffer, 'TransformListener': buffer.listen}
     errors = {'TransformException': LookupError, 'ExtrapolationException': IndexError}
-    monkeypatch.setitem(sys.modules, 'tf2_ros', types.SimpleNamespace(**parts, **errors))
+    parts = types.SimpleNamespace(Buffer=lambda: buffer, **errors)
+    monkeypatch.setitem(sys.modules, 'tf2_ros', parts)
+    # Any message: none is sent.
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', types.SimpleNamespace(TFMessage=Imu))
     return buffer
+
+
+def test_what_tf_sends_is_kept_and_its_newest_stamp_known():
+    kept, known = [], [TransformStamped(child_frame_id=name) for name in 'ab']
+    known[0].header.stamp.sec = 7
+    message = types.SimpleNamespace(transforms=known)
+    assert transforms.keep_transforms(lambda one, _: kept.append(one), message) == 7.0
+    assert kept == known
+
+
+@pytest.mark.parametrize('name', ['base', 'sensor'])
+def test_names_of_frames_are_refused_as_tf2_does(name):
+    with pytest.raises(ConfigError, match=rf"^frame.{name} = '/base': must not begin with /"):
+        transforms.check_tf2(Config().replace(**{f'frame.{name}': '/base'}))
 
 
 def cloud_of(points, seconds, nanosec=0):
@@ -151,7 +164,7 @@ def test_tilt_by_tf_is_as_good_as_given(tf):
         assert b.segment(cloud_of(points, 3))[0].width == (label == Label.GROUND).sum()
         for level, n_listeners in (('sensor', 0), ('tf', 1)):
             assert not b.set('frame.level', level)
-            assert tf.n_listeners == n_listeners
+            wait_for(lambda n=n_listeners: b.probe.count_subscribers('/tf') == n, 'TF')
 
 
 def test_clouds_wait_for_the_transform_of_their_stamp(monkeypatch, tf):
@@ -191,7 +204,7 @@ def test_place_of_the_sensor_by_tf(tf):
         b.wait_for_status('model', lambda v, s: v['Taken from the scan'] == 'height')
         # Without it the height is not known, and nothing is ground.
         assert not b.set('frame.sensor', 'none')
-        assert tf.n_listeners == 0
+        wait_for(lambda: not b.probe.count_subscribers('/tf'), 'end of the subscription')
         assert b.segment(message)[0].width == 0
 
 
@@ -218,13 +231,12 @@ def bench_with_imu():
         wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription of imu')
 
         def say(matrix, stamp, frame='tilted_lidar', covariance=0.01):
-            n_before = len(b.node._frames._imu._messages)
             message = Imu(orientation=quaternion(matrix))
             message.header.stamp.sec, message.header.stamp.nanosec = stamp
             message.header.frame_id = frame
             message.orientation_covariance[0] = covariance
             publisher.publish(message)
-            wait_for(lambda: len(b.node._frames._imu._messages) > n_before, 'orientation')
+            time.sleep(0.05)  # it is taken when a cloud comes or waits
 
         yield b, say
 
@@ -261,6 +273,30 @@ def test_tilt_by_an_imu(monkeypatch):
         assert not b.set('frame.level', 'sensor')
         wait_for(lambda: not b.probe.count_subscribers('imu'), 'end of the subscription')
         assert len(b.segment(cloud_of(points, 7))) == 2
+
+
+def test_a_node_that_is_behind_takes_all_orientations_before_it_refuses(monkeypatch):
+    points, turn = turned_street()
+    message = cloud_of(points, 3)
+    with bench_with_imu() as (b, say):
+        # They lie in the queue while it does something else, and there is no time to wait.
+        monkeypatch.setattr(transforms, 'MAX_WAIT', 0.0)
+        is_busy = threading.Event()
+        b.node.executor.create_task(lambda: is_busy.set() or time.sleep(3.0))
+        is_busy.wait(10.0)
+        b.publisher.publish(message)
+        for k in range(20):
+            say(np.eye(3), (2, 10_000_000 * k))
+        say(turn, (3, 1))
+        check_levelled(points, message, (b.ground.wait(1)[0], b.obstacles.wait(1)[0]))
+        # They come late, the older ones first.
+        monkeypatch.setattr(transforms, 'MAX_WAIT', 0.2)
+        late = cloud_of(points, 5)
+        b.publisher.publish(late)
+        for k in range(10):
+            say(np.eye(3), (4, 10_000_000 * k))
+        say(turn, (5, 1))
+        check_levelled(points, late, (b.ground.wait(2)[1], b.obstacles.wait(2)[1]))
 
 
 def test_tilt_by_an_imu_in_another_frame(tf):

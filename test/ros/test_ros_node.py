@@ -75,17 +75,19 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(tmp_path):
         # 0.4 s back is no jump: several sensors may send.
         for second, nanosec in ((0, 0), (1, 4 * 10**8), (1, 0), (2, 0), (0, 0), (1, 0), (0, 0)):
             b.segment(to_message(points, (1317383000 + second, nanosec), 'velo_link'))
-        b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.OK)
+        b.wait_for_status('input', lambda _, s: 'use_sim_time for a recording' in s.message)
         statuses = [b.wait_for_status('input', lambda v, _: v['Events since startup'] == '7')]
         statuses += [b.wait_for_status(task, lambda v, _: v) for task in ('processing', 'model')]
         # Throttled: two jumps, one message; clouds for half a second, one line on them.
         log = said('time jumped back by 2.0 s', 'clouds segmented so far: ')
         assert log.count('time jumped back') == log.count('segmented so far') == 1
 
-    for status in statuses:
-        assert (status.level, status.hardware_id) == (DiagnosticStatus.OK, b.node_name)
+    for status, level in zip(
+        statuses, (DiagnosticStatus.WARN, *2 * [DiagnosticStatus.OK]), strict=True
+    ):
+        assert (status.level, status.hardware_id) == (level, b.node_name)
+    assert statuses[0].message.startswith('stamps are of another clock, 4')
     values = ros.values_of(statuses[0])
-    # A stamp of 2011 is old, and nothing is wrong with that.
     assert float(values['Age of last stamp (s)']) > 1e8
     assert values['QoS'] == 'reliable, keep_last 1, volatile'
     assert values['Time jumps since startup'] == '2'
@@ -108,8 +110,9 @@ def test_simulated_time_that_jumps_back_is_counted_once():
         tell(1317383000)
         b.segment(to_message(street(3000), stamp=(1317382999, 500000000)))
         # A stamp of 2011 is half a second old: ages are on the node's clock.
-        values = wait_for_input('Events since startup', '1')
-        assert values['Age of last stamp (s)'] == '0.500'
+        status = b.wait_for_status('input', lambda v, _: v['Events since startup'] == '1')
+        assert ros.values_of(status)['Age of last stamp (s)'] == '0.500'
+        assert status.level == DiagnosticStatus.OK
         tell(1317382000)
         wait_for_input('Time jumps since startup', '1')
         # The first cloud of the next round: the same jump.
@@ -218,7 +221,7 @@ def test_bad_clouds_among_good_ones_are_refused_with_one_message(b, tmp_path):
         assert status.level == DiagnosticStatus.ERROR and 'no field named z' in status.message
         assert ros.values_of(status)['Frame'] == 'broken'
         b.segment(good)
-        b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.OK)
+        b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.WARN)  # of its stamps
         # Throttled: four clouds, one message with topic, frame and reason.
         log = said(f"cloud on {NAMESPACE}/points in frame 'broken' refused: ")
         assert log.count('refused') == log.count('no field named z') == 1
@@ -248,7 +251,7 @@ def test_times_of_the_stages_are_logged_at_level_debug(b, tmp_path):
         b.node.get_logger().set_level(LoggingSeverity.INFO)
     (times,) = re.findall(r'times of the stages \[ms\]: (.*)', log)
     names, numbers = zip(*(part.split() for part in times.split(', ')), strict=True)
-    stages = 'queue grid pose faces lines learning surface label total publish'
+    stages = 'queue frames grid pose faces lines learning surface label total publish'
     assert sorted(names) == sorted(stages.split())
     assert sum(map(float, numbers)) > 0.0
 
@@ -256,8 +259,42 @@ def test_times_of_the_stages_are_logged_at_level_debug(b, tmp_path):
 def test_the_wait_of_a_cloud_is_a_part_of_its_latency(b, monkeypatch):
     latencies = []
     task = b.node._diagnostics.processing
-    monkeypatch.setattr(task, 'processed', lambda latency, _backend: latencies.append(latency))
+    monkeypatch.setattr(task, 'processed', lambda latency, *_: latencies.append(latency))
     received = {'received_timestamp': time.time_ns() - 100 * 10**9}
     b.in_executor(b.node._input._receive, to_message(street(500)), received)
     ros.wait_for(lambda: latencies, 'latency')
     assert 100.0 < latencies[0] < 130.0
+
+
+@pytest.mark.parametrize(
+    ('off', 'said'),
+    [(0.9, ''), (3600.0, '3600.0 s before'), (-3600.0, '3600.0 s after'), (None, ' s before')],
+)
+def test_stamps_of_another_clock_are_a_warning(b, off, said):
+    """An hour off either way, or all the same; the wait in a queue of ours does not count."""
+    send_time = time.time_ns() - 10 * 10**9
+    for k in range(10):
+        sent = send_time + k * 10**9
+        seconds, rest = divmod(sent - round(1e9 * (off or 0.0)), 10**9)
+        stamp = (seconds, rest) if off is not None else (send_time // 10**9, 0)
+        info = {'source_timestamp': sent}
+        b.in_executor(b.node._input._receive, to_message(street(50), stamp), info)
+    status = b.wait_for_status('input', lambda *_: True)
+    level = DiagnosticStatus.WARN if said else DiagnosticStatus.OK
+    assert status.level == level and said in status.message
+    assert ('timestamp mode of the driver' in status.message) == bool(said)
+
+
+def test_what_the_library_says_of_a_cloud_its_node_says(b, tmp_path):
+    """Not the other nodes of the process."""
+    words = '--ros-args', *ros.given({'runtime.backend': 'numpy'})
+    silent = ros.GroundSegmentationNode(
+        context=b.node.context, namespace='/silent', cli_args=words
+    )
+    with ros.stderr_in(tmp_path) as said:
+        assert not b.set('sensor.height', 5.0)
+        b.segment(to_message(street(3000)))
+        log = said('is sensor.height right')
+        silent.destroy_node()
+        assert not b.set('sensor.height', 'auto')
+    assert log.count('is sensor.height right') == 1

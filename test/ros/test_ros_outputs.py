@@ -1,11 +1,13 @@
 """The topics: every byte of a cloud, and the optional ones, which cost nothing unasked."""
 
+import time
 from array import array
 
 import numpy as np
 import pytest
 import ros_helpers as ros
 from nav_msgs.msg import OccupancyGrid
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros_helpers import street, to_message, xyz_of
 from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 
@@ -67,6 +69,24 @@ def test_ground_model_gives_the_height_anywhere(b):
     for found, wanted in ((height, expected.ground_z), (std, expected.ground_std)):
         off = np.abs(found - wanted)[ground]
         assert np.nanmedian(off) < 1e-4 and np.nanquantile(off, 0.95) < 1e-3
+
+
+def test_a_reader_that_is_transient_local_gets_a_grid_of_the_last_second_only(b):
+    message = to_message(street(3000))
+    profile = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    received(b, '~/occupancy', message)
+    time.sleep(1.0)
+    readers = [ros.Collector(b.probe, OccupancyGrid, f'{b.node_name}/occupancy', profile)]
+    ros.wait_for(lambda: b.node._outputs.n_subscribers()[readers[0].subscription.topic_name], 'it')
+    time.sleep(0.3)
+    assert not readers[0].messages
+    b.segment(message)
+    readers[0].wait(1)
+    # The next one comes at once.
+    readers.append(ros.Collector(b.probe, OccupancyGrid, f'{b.node_name}/occupancy', profile))
+    readers[1].wait(1)
+    for reader in readers:
+        b.forget(reader)
 
 
 REDUCED = {

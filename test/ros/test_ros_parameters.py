@@ -111,7 +111,10 @@ WRONG = {
     'grid.n_segments': ['grid.n_segments = 3: must be an integer in [4, 2048]', 3, 90.0],
     'runtime.backend': ["runtime.backend = 'gpu': must be one of auto, numba, numpy", 'gpu'],
     'grid.r_max': ['grid.r_min = 2: must be below grid.r_max = 1.5', 1.5],
-    'input.crop_box': ['must be none or six numbers in [', [1.0, -1.0, 0.0, 1.0, 0.0, 1.0]],
+    'input.crop_box': [
+        'input.crop_box = [1.0, -1.0, 0.0, 1.0, 0.0, 1.0]: must be none or six numbers in [',
+        [1.0, -1.0, 0.0, 1.0, 0.0, 1.0],
+    ],
     'lable.ground_tolerance': ['did you mean label.ground_tolerance?', 0.1],
 }  # fmt: skip
 """For each name the reason of the first refusal, and values; the others have its end."""
