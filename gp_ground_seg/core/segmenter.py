@@ -162,10 +162,9 @@ class GroundSegmenter:
         # 1. Polar grid: the lowest point of each cell is a ground candidate.
         # 2. Sensor pose, from a plane through the candidates near the sensor: a tilted scan is
         #    levelled, mirror images are raised, and a low sensor has narrower gates.
-        scan, pose, images = self._level(xyz, sensor, timer, fallback)
-        config = for_sensor(self._config, pose)
+        scan, pose, images, config = self._level(xyz, sensor, timer, fallback)
         # 3. Vertical faces: walls, fences, sides of cars.
-        faces = backend.find_faces(scan, config)
+        faces = backend.find_faces(scan, pose.sensor_height, config)
         timer.mark('faces')
         # 4. Relief of the land. Lines along each segment, over it, without lowest points of faces
         #    with occluded base, and pseudo-inputs. The prior mean is the ground below the sensor.
@@ -246,7 +245,7 @@ class GroundSegmenter:
         sensor: SensorConfig,
         timer: StageTimer,
         fallback: SensorPose | None,
-    ) -> tuple[Scan, SensorPose, MirrorImages]:
+    ) -> tuple[Scan, SensorPose, MirrorImages, Config]:
         """Scan in the level frame, about the sensor, with mirror images raised.
 
         Its angles are those given, estimated or of `fallback`.
@@ -266,7 +265,11 @@ class GroundSegmenter:
         pose = estimate_pose(sensor, None if objection else view, elsewhere, objection)
         if fallback is not None:
             pose = with_fallback(pose, fallback, sensor)
-        if (pose.roll, pose.pitch) != (given.roll, given.pitch):
+        config = for_sensor(config, pose)
+        if (pose.roll, pose.pitch) != (
+            given.roll,
+            given.pitch,
+        ) or config.grid != self._config.grid:
             scan = backend.build_grid(pose.level(about), config)
         if objection == LOWER_ENDS and pose.is_height_default:
             nothing = np.zeros(len(scan.candidates.r), dtype=np.bool_)
@@ -276,7 +279,7 @@ class GroundSegmenter:
         if len(images.points) > 0:
             scan = images.left_out(backend.build_grid(images.raised(scan.xyz), config))
         timer.mark('pose')
-        return scan, pose, images
+        return scan, pose, images, config
 
     def _past_images(self, scan: Scan, below: View | None) -> tuple[View | None, Scan]:
         """View of a mirror: by the candidates that are no images of it, if these show one.

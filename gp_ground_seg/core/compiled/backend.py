@@ -52,7 +52,7 @@ class NumbaBackend:
         """Sort points into cells and tiles; lowest point of each cell."""
         xyz, n_points, dtype = in_columns(xyz), len(xyz), xyz.dtype
         geometry = grid_geometry(config.grid, config.faces.cell_size, dtype)
-        n_segments, n_bins = config.grid.n_segments, config.grid.n_bins
+        n_segments, n_bins = config.grid.n_segments, len(geometry.edges) - 1
         cell, tile = np.empty(n_points, np.int32), np.empty(n_points, np.int32)
         grid = PolarGrid(cell, np.empty(n_points, dtype), geometry.edges, n_segments)
         n_places = geometry.n_sides**2
@@ -67,11 +67,11 @@ class NumbaBackend:
         tiles = tiles._replace(extremes=tiles.extremes[:n], place=tiles.place[:n])
         return Scan(xyz, grid, tiles, candidates.first(n_candidates))
 
-    def find_faces(self, scan: Scan, config: Config) -> Faces:
-        """Tiles that hold a vertical face."""
+    def find_faces(self, scan: Scan, height: float, config: Config) -> Faces:
+        """Tiles that show no ground."""
         result = Faces.none(scan.tiles)
         groups = numbers_of(config.faces), numbers_of(config.label)
-        faces_.find_faces(scan.xyz.T, scan.tiles, *groups, result)
+        faces_.find_faces(scan.xyz.T, scan.tiles, height, *groups, result)
         return result
 
     def find_relief(

@@ -32,6 +32,7 @@ from gp_ground_seg.core.pipeline.labels import (
     VOTE_UNITS,
     band_margin,
     face_margin,
+    foot_of_face,
     ground_band,
     is_near,
     layer_of,
@@ -71,14 +72,15 @@ def label_points(
     """
     tiles, n_tiles = scan.tiles, len(scan.tiles.place)
     sums, bands = np.zeros((n_tiles + 1, 2), np.int64), np.zeros(n_tiles + 1)
+    feet = np.empty(n_tiles + 1)
     has_obstacle = np.zeros(n_tiles + 1, np.bool_)
     pieces = _fit_pieces(surface)
     _survey(scan, faces.is_face, pieces, relief, is_level, units, result.height, sums)
     if by_roughness:
         set_roughness(tiles, sums, units, bands)
     for t in range(n_tiles + 1):
-        bands[t] = ground_band(bands[t], config)
-    _label_by_bands(scan, faces, config, depth, bands, has_obstacle, result)
+        feet[t], bands[t] = foot_of_face(bands[t], config), ground_band(bands[t], config)
+    _label_by_bands(scan, faces, feet, depth, bands, has_obstacle, result)
     if by_roughness:
         _vote(scan, lowest, has_obstacle, config, result)
 
@@ -164,7 +166,7 @@ def _add_squares(
 def _label_by_bands(
     scan: Scan,
     faces: Faces,
-    config: LabelConfig,
+    feet: FloatArray,
     depth: float,
     bands: FloatArray,
     has_obstacle: BoolArray,
@@ -172,8 +174,9 @@ def _label_by_bands(
 ) -> None:
     """Label the points from their heights in `result`, and find tiles of obstacles.
 
-    Ground reaches `depth` below the surface, and `bands` (T + 1,) above it [m]. `has_obstacle`
-    becomes true where a return near the surface is no ground.
+    Ground reaches `depth` below the surface, `bands` (T + 1,) above it, and `feet` (T + 1,) above
+    the lowest return of a face [m]. `has_obstacle` becomes true where a return near the surface is
+    no ground.
     """
     z, tile, cell = scan.xyz[2], scan.tiles.tile, scan.grid.cell
     is_face, is_occluded, extremes = faces.is_face, faces.has_occluded_base, scan.tiles.extremes
@@ -183,7 +186,7 @@ def _label_by_bands(
         margin = band_margin(height[i], bands[t], depth)
         if is_face[t]:
             over_lowest = np.float64(z[i]) - np.float64(extremes[t, 0])
-            margin = face_margin(margin, over_lowest, is_occluded[t], config.ground_tolerance)
+            margin = face_margin(margin, over_lowest, is_occluded[t], feet[t])
         margins[i] = margin
         if margin < 0.0 and is_near(height[i]):
             has_obstacle[t] = True

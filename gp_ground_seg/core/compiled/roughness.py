@@ -20,6 +20,7 @@ from gp_ground_seg.core.pipeline.roughness import (
     NEAR,
     ROUGHNESS,
     SQUARE_EDGES,
+    UNKNOWN_LEVEL,
     WIDE,
     Window,
 )
@@ -48,43 +49,42 @@ def set_roughness(
     units : float
         Whole units of squared heights for 1 m^2.
     roughness : (T + 1,) float64
-        Stays as it is where no return is near the surface, and for points in no tile.
+        Stays as it is if no return is near the surface, and for points in no tile.
     """
-    known, level, of_frame = _known_levels(sums, units)
-    n_sides, place = int(math.sqrt(len(tiles.at))), np.empty(len(known), np.int32)
-    for k in range(len(known)):
-        place[k] = tiles.place[np.uintp(known[k])]
-    near = _levels_about(place, level, n_sides, NEAR, of_frame)
-    wide = _levels_about(place, level, n_sides, WIDE, of_frame)
-    for k in range(len(known)):
-        most = MOST_OVER_WIDE * ROUGHNESS[np.uintp(wide[k])]
-        roughness[np.uintp(known[k])] = min(ROUGHNESS[np.uintp(near[k])], most)
+    level, n_known, of_frame = _levels(sums, units)
+    if n_known == 0:
+        return
+    n_sides = int(math.sqrt(len(tiles.at)))
+    near = levels_about(tiles.place, level, n_sides, NEAR, of_frame)
+    wide = levels_about(tiles.place, level, n_sides, WIDE, of_frame)
+    for t in range(len(level)):
+        most = MOST_OVER_WIDE * ROUGHNESS[np.uintp(wide[t])]
+        roughness[t] = min(ROUGHNESS[np.uintp(near[t])], most)
 
 
 @jit()
-def _known_levels(sums: IntArray, units: float) -> tuple[CellArray, CellArray, int]:
-    """Tiles with a return near the surface, the level of each (K,), and the median of these."""
-    counts, n_known = np.zeros(N_LEVELS, np.int64), 0
-    n_tiles = len(sums) - 1
-    known, level = np.empty(n_tiles, np.int32), np.empty(n_tiles, np.int32)
+def _levels(sums: IntArray, units: float) -> tuple[CellArray, int, int]:
+    """Level of each tile, (T,), of how many it is known, and the median of these."""
+    counts, n_known, n_tiles = np.zeros(N_LEVELS, np.int64), 0, len(sums) - 1
+    level = np.empty(n_tiles, np.int32)
     for t in range(n_tiles):
-        number = sums[t, 0]
+        number, level[t] = sums[t, 0], UNKNOWN_LEVEL
         if number > 0:
             square = np.float64(sums[t, 1]) / (units * np.float64(number))
             found = 0
             for k in range(len(SQUARE_EDGES)):
                 found += np.int64(square >= SQUARE_EDGES[k])
-            known[n_known], level[n_known] = t, found
+            level[t] = found
             counts[found] += 1
             n_known += 1
-    return known[:n_known], level[:n_known], _level_at(counts, n_known, 0.5)
+    return level, n_known, level_at(counts, n_known, 0.5)
 
 
 @jit()
-def _levels_about(
-    place: CellArray, level: CellArray, n_sides: int, window: Window, of_frame: int
+def levels_about(
+    place: CellArray, level: CellArray, n_sides: int, window: Window, prior_level: int
 ) -> CellArray:
-    """Level in the window about the tiles at each `place` (K,), of known `level`, (K,)."""
+    """See the plain `levels_about`."""
     shift, n_rows = window.shift, 1
     # Blocks in a square with one more at each side, so that each has eight around it.
     width = (n_sides - 1 >> shift) + 3
@@ -102,12 +102,13 @@ def _levels_about(
     # the sums.
     counts = np.zeros(n_rows * N_WORDS, np.uint64)
     for k in range(len(place)):
-        counts[np.uintp(own[k] * N_WORDS + level[k] // 8)] += _byte(1, level[k])
+        if level[k] != UNKNOWN_LEVEL:
+            counts[np.uintp(own[k] * N_WORDS + level[k] // 8)] += _byte(1, level[k])
     about, level_of_row = np.empty(N_WORDS, np.uint64), np.empty(n_rows, np.int32)
     for n in range(1, n_rows):
         for w in range(N_WORDS):
             about[w] = 0
-        about[of_frame // 8] = _byte(window.prior, of_frame)
+        about[prior_level // 8] = _byte(window.prior, prior_level)
         for step in range(-width, width + 1, width):
             for beside in range(row_to_block[n] + step - 1, row_to_block[n] + step + 2):
                 first = block_to_row[np.uintp(beside)] * N_WORDS
@@ -120,7 +121,7 @@ def _levels_about(
 
 
 @jit()
-def _level_at(counts: IntArray, n: int, share: float) -> int:
+def level_at(counts: IntArray, n: int, share: float) -> int:
     """Level that a `share` of `n` tiles, counted by level, does not exceed; 0 without any."""
     most, cumulative, level = share * (n - 1), counts[0], 0
     while cumulative <= most:
@@ -144,7 +145,7 @@ def _sum_of_bytes(word: Any) -> Any:
 
 @jit()
 def _level_in(words: WordArray, share: float) -> int:
-    """Do what `_level_at` does, of counts in bytes."""
+    """Do what `level_at` does, of counts in bytes."""
     total = 0
     for w in range(N_WORDS):
         total += _sum_of_bytes(words[w])

@@ -1,7 +1,7 @@
 """Compiled twin of `gp_ground_seg.core.pipeline.vertical_faces`.
 
-Of the tiles with a high return, the returns are summed, the lowest and those above apart; the sums
-tell which tiles hold a face. Coordinates are rounded so that the sums are exact in any order.
+Of the tiles to examine, the returns are summed, the lowest and those above apart; the sums
+tell which tiles show no ground. Coordinates are rounded so that the sums are exact in any order.
 """
 
 from __future__ import annotations
@@ -10,15 +10,25 @@ import math
 
 import numpy as np
 
+from gp_ground_seg.core.compiled.roughness import level_at, levels_about
 from gp_ground_seg.core.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Tiles
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import FacesConfig, LabelConfig
+from gp_ground_seg.core.pipeline.roughness import N_LEVELS, UNKNOWN_LEVEL
 from gp_ground_seg.core.pipeline.vertical_faces import (
+    OWN_SHARE,
+    SCATTER,
+    SCATTERED,
+    SQUARE_SCATTERS,
     SUMS,
     UNITS_PER_METRE,
+    UNKNOWN,
     face_height,
     is_base_occluded,
+    is_examined,
     is_vertical,
+    scatter_square,
+    smooth_up_to,
 )
 
 # Each tall tile has two rows, for the lowest returns and for those above: their sums and the
@@ -34,11 +44,17 @@ _TO_UNITS = 1.5 * 2.0**52 / UNITS_PER_METRE
 
 @jit(entry=True)
 def find_faces(
-    columns: PointArray, tiles: Tiles, config: FacesConfig, label: LabelConfig, faces: Faces
+    columns: PointArray,
+    tiles: Tiles,
+    height: float,
+    config: FacesConfig,
+    label: LabelConfig,
+    faces: Faces,
 ) -> None:
-    """Find the tiles of points (3, N) that hold a face, into `faces`, where there is none yet."""
-    tall, tile_to_row = _select_tall(tiles, label)
+    """Find the tiles of points (3, N) that show no ground, into `faces`, which has none yet."""
+    tall, tile_to_row = _select_tall(tiles, height, label)
     sums = _sum_returns(columns, tiles, tall, config.cell_size, label, tile_to_row)
+    square = np.empty(len(tall))
     for k in range(len(tall)):
         low, high = sums[2 * k], sums[2 * k + 1]
         # No branch: between branches, references to the rows would be counted.
@@ -47,17 +63,54 @@ def find_faces(
         faces.is_face[np.uintp(tall[k])] = is_face
         is_occluded = is_face & is_base_occluded(low, high, config)
         faces.has_occluded_base[np.uintp(tall[k])] = is_occluded
+        square[k] = UNKNOWN if is_face else scatter_square(low, high)
+    _mark_scattered(tiles, tall, square, height, label, faces)
 
 
 @jit()
-def _select_tall(tiles: Tiles, label: LabelConfig) -> tuple[CellArray, CellArray]:
-    """List the tall tiles, (K,), and the first of the two rows of each tile, or `NOT_TALL`."""
+def _mark_scattered(
+    tiles: Tiles,
+    tall: CellArray,
+    square: FloatArray,
+    height: float,
+    label: LabelConfig,
+    faces: Faces,
+) -> None:
+    """Mark raised tiles about which many scatter. See the plain `_scattered`."""
+    n, face = len(tall), face_height(label)
+    place, level = np.empty(n, np.int32), np.empty(n, np.int32)
+    counts, n_own = np.zeros(N_LEVELS, np.int64), 0
+    for k in range(n):
+        low, high = tiles.extremes[tall[k], 0], tiles.extremes[tall[k], 1]
+        over = np.float64(low) + height
+        place[k], level[k] = tiles.place[tall[k]], UNKNOWN_LEVEL
+        if square[k] == UNKNOWN:
+            continue
+        found = 0
+        for edge in range(len(SQUARE_SCATTERS)):
+            found += np.int64(square[k] >= SQUARE_SCATTERS[edge])
+        if over > 0.5 * face:
+            level[k] = found
+        elif over > -0.5 * face and np.float64(high) - np.float64(low) <= face:
+            counts[found] += 1
+            n_own += 1
+    limit = smooth_up_to(SCATTER[level_at(counts, n_own, OWN_SHARE)])
+    about = levels_about(place, level, int(math.sqrt(len(tiles.at))), SCATTERED, 0)
+    for k in range(n):
+        over = np.float64(tiles.extremes[tall[k], 0]) + height
+        if level[k] != UNKNOWN_LEVEL and over > face and SCATTER[about[k]] > limit:
+            faces.is_face[tall[k]] = faces.has_occluded_base[tall[k]] = True
+
+
+@jit()
+def _select_tall(tiles: Tiles, height: float, label: LabelConfig) -> tuple[CellArray, CellArray]:
+    """List the tiles to examine, (K,), and the first of the two rows of each, or `NOT_TALL`."""
     extremes, n_tiles, n_tall = tiles.extremes, len(tiles.extremes), 0
     tall, tile_to_row = np.empty(n_tiles, np.int32), np.empty(n_tiles, np.int32)
     for t in range(n_tiles):
-        height = np.float64(extremes[t, 1]) - np.float64(extremes[t, 0])
+        low, high = np.float64(extremes[t, 0]), np.float64(extremes[t, 1])
         tile_to_row[t] = NOT_TALL
-        if height > face_height(label):
+        if is_examined(high - low, low + height, tiles.place[t], label):
             tall[n_tall], tile_to_row[t] = t, 2 * n_tall
             n_tall += 1
     return tall[:n_tall], tile_to_row

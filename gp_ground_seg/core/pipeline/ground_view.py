@@ -55,10 +55,13 @@ COLUMNS, COLUMNS_REACH = 0.55, 20.0
 """Share of the candidates on a plane, up to this range [m], with a column over them, from which
 they are lower ends, unless there is a floor: of whole scans outdoors the most was 0.37, of cut
 ones mostly 0.6 to 1."""
-FLOOR_SCATTER = 0.025
+BEFORE = 0.1
+"""Distance from which a return before a column is of the floor before it [m]."""
+FLOOR_SCATTER, ROUGH_FLOOR = 0.025, 0.18
 """Distance of the quartiles of the heights of all candidates on the plane, or of those without a
 column, up to which they lie on a floor [m]: 0.003 to 0.02 in crowded rooms and corridors, 0.03 to
-0.15 where the ground was cut away."""
+0.15 where the ground was cut away; and how much more it may be where all are without a column:
+rough paths between hedges have 0.05 where a third are."""
 CUT_TILT = 0.08
 """Tilt [rad] from which a plane is not that at which ground was cut away."""
 FLOOR_SHARE = 0.1
@@ -203,19 +206,22 @@ def _shows_lower_ends(plane: GroundPlane, scan: Scan) -> bool:
     height = plane.below(candidates.x, candidates.y, candidates.z)
     tolerance = np.where(candidates.r < COLUMNS_REACH, tolerance_at(candidates.r), 0.0)
     is_near, (low, high) = np.abs(height) < tolerance, COLUMN
-    height, tile = height[is_near], as_index(candidates.tile[is_near])
+    height, tile, r = height[is_near], as_index(candidates.tile[is_near]), candidates.r[is_near]
     enough = COLUMNS * len(tile)
     if np.count_nonzero((tiles.extremes[:, 1] - tiles.extremes[:, 0])[tile] > low) <= enough:
         return False
     over = plane.below(*scan.xyz.T)
-    has_next = np.zeros(len(tiles.extremes), dtype=np.bool_)
-    has_next[tiles.tile[(over > low) & (over < high) & (tiles.tile >= 0)]] = True
-    alone = height[~has_next[tile]]
+    in_column = (over > low) & (over < high) & (tiles.tile >= 0)
+    column_r = np.full(len(tiles.extremes), np.inf)
+    np.minimum.at(column_r, tiles.tile[in_column], scan.grid.r[in_column])
+    # Floor before a column is nearer than what stands on it.
+    alone = height[r < column_r[tile] - BEFORE]
     if len(tile) - len(alone) <= enough:
         return False
     floors = [z for z in (height, alone) if len(z) > FLOOR_SHARE * len(tile)]
     scatter = [np.subtract(*np.quantile(z, (0.75, 0.25))) for z in floors]
-    return bool(min(scatter, default=np.inf) > FLOOR_SCATTER)
+    floor_scatter = max(FLOOR_SCATTER, ROUGH_FLOOR * len(alone) / len(tile))
+    return bool(min(scatter, default=np.inf) > floor_scatter)
 
 
 def refusal(view: View, given: FloatArray) -> str:

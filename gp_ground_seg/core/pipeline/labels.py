@@ -39,9 +39,9 @@ of returns spread evenly over the height of grass all are within 1.7, of those n
 98 in 100 are within 2.1."""
 RETURN_NOISE = 0.02
 """Standard deviation of the height of a single return by the noise of the sensor [m]."""
-FACE_SHARE = 0.5
+FACE_SHARE, ROUGH_FOOT = 0.5, 0.05
 """Part of the tolerance up to which a return over the lowest of a vertical face is ground before
-the vote."""
+the vote, and up to which height it is where the ground about it is rough [m]."""
 LAYERS_PER_TOLERANCE = 4.0
 N_LAYERS = 64
 """Layers of a tile, after which they are counted from the first again: returns near the surface
@@ -77,7 +77,7 @@ def label_points(
         margin[of_face],
         z[of_face] - tiles.lowest_z[tile[of_face]],
         faces.has_occluded_base[tile[of_face]],
-        label.ground_tolerance,
+        foot_of_face(roughness, label)[tile[of_face]],
     )
     if label.rule == 'roughness':
         voters = np.flatnonzero(is_near(height))
@@ -120,12 +120,17 @@ def band_margin(height: Values, band: Values, depth: float) -> Values:
 
 
 @shared
-def face_margin(
-    margin: Values, over_lowest: Values, is_occluded: Values, tolerance: float
-) -> Values:
+def foot_of_face(roughness: Values, label: LabelConfig) -> Values:
+    """Height over the lowest return of a vertical face up to which others are ground [m]."""
+    by_roughness = np.minimum(ROUGHNESS_IN_BAND * roughness, ROUGH_FOOT)
+    return np.maximum(by_roughness, FACE_SHARE * label.ground_tolerance)
+
+
+@shared
+def face_margin(margin: Values, over_lowest: Values, is_occluded: Values, foot: Values) -> Values:
     """Margin of a point in a vertical face [m]; `over_lowest` is its height over the lowest."""
     # With a limit below zero no return of the tile is ground; the margin stays a distance.
-    in_face = FACE_SHARE * tolerance * (1.0 - 2.0 * is_occluded) - over_lowest
+    in_face = foot * (1.0 - 2.0 * is_occluded) - over_lowest
     # Without a surface `margin` is NaN, and stays so.
     return choose(in_face < margin, in_face, margin)
 

@@ -28,6 +28,7 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
     if share >= 1.0 or config.label.rule != 'roughness':
         return config
     names = (
+        'grid.r_min',
         'growth.seed_height_tolerance',
         'growth.max_std',
         'label.ground_tolerance',

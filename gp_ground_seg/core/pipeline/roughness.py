@@ -21,7 +21,7 @@ SQUARE_EDGES = EDGES * EDGES
 """Roughness between its levels, 14 % from one to the next, and the mean squares [m, m^2]."""
 ROUGHNESS = np.concatenate([[0.01], EDGES * math.sqrt(1.14)])
 """Roughness of each level: the geometric mean of its edges [m]."""
-N_LEVELS = len(ROUGHNESS)
+N_LEVELS, UNKNOWN_LEVEL = len(ROUGHNESS), -1
 
 
 class Window(NamedTuple):
@@ -29,7 +29,7 @@ class Window(NamedTuple):
 
     shift: int  # a block has 2^shift tiles along a side
     share: float  # part of the tiles that are at most as rough as the result
-    prior: int  # tiles as rough as the median of the frame that count beside those seen
+    prior: int  # tiles of a given level that count beside those seen
 
 
 NEAR, WIDE = Window(1, 0.8, 4), Window(2, 0.5, 16)
@@ -39,7 +39,7 @@ MOST_OVER_WIDE = 3.4
 
 
 def ground_roughness(tiles: Tiles, sums: FloatArray, units: float) -> FloatArray:
-    """Roughness of the ground in each tile, (T + 1,) [m]; 0 where no return is near the surface.
+    """Roughness of the ground about each tile, (T + 1,) [m]; 0 if no return is near the surface.
 
     Parameters
     ----------
@@ -53,26 +53,29 @@ def ground_roughness(tiles: Tiles, sums: FloatArray, units: float) -> FloatArray
 
     The last one, for points in no tile, is 0.
     """
-    roughness = np.zeros(len(tiles.place) + 1)
-    known = np.flatnonzero(sums[0])
-    if len(known) == 0:
+    roughness, is_known = np.zeros(len(tiles.place) + 1), sums[0] > 0
+    if not is_known.any():
         return roughness
-    n_near, squares = sums[:, known]
-    level = np.searchsorted(SQUARE_EDGES, squares / (units * n_near), side='right')
-    counts = np.bincount(level, minlength=N_LEVELS)
-    of_frame = int(_level_at(counts[None, :], 0.5)[0])
+    n_near, squares = sums[:, is_known]
+    level = np.full(len(tiles.place), UNKNOWN_LEVEL)
+    level[is_known] = np.searchsorted(SQUARE_EDGES, squares / (units * n_near), side='right')
+    counts = np.bincount(level[is_known], minlength=N_LEVELS)
+    of_frame = int(level_at(counts[None, :], 0.5)[0])
     near, wide = (
-        ROUGHNESS[_levels_about(tiles.place[known], level, tiles.n_sides, window, of_frame)]
+        ROUGHNESS[levels_about(tiles.place, level, tiles.n_sides, window, of_frame)]
         for window in (NEAR, WIDE)
     )
-    roughness[known] = np.minimum(near, MOST_OVER_WIDE * wide)
+    roughness[:-1] = np.minimum(near, MOST_OVER_WIDE * wide)
     return roughness
 
 
-def _levels_about(
-    places: CellArray, level: IntArray, n_sides: int, window: Window, of_frame: int
+def levels_about(
+    places: CellArray, level: IntArray, n_sides: int, window: Window, prior_level: int
 ) -> IntArray:
-    """Level about the tiles at `places` (K,), of known `level`; `of_frame` is their median."""
+    """Level about each tile at `places` (K,), of those of which it is known, (K,).
+
+    `level` (K,) is their own, or `UNKNOWN_LEVEL`; `prior_level` that of the tiles of the prior.
+    """
     column, row = np.divmod(as_index(places), n_sides)
     # Blocks in a square with one more at each side, so that each has eight around it.
     width = (n_sides - 1 >> window.shift) + 3
@@ -84,17 +87,18 @@ def _levels_about(
     shape = len(blocks) + 1, N_LEVELS
     block_to_row = np.full(width * width, len(blocks))
     block_to_row[blocks] = np.arange(len(blocks))
-    own = block_to_row[place]
-    counts = np.bincount(own * N_LEVELS + level, minlength=shape[0] * N_LEVELS).reshape(shape)
+    own, is_known = block_to_row[place], level != UNKNOWN_LEVEL
+    entry = own[is_known] * N_LEVELS + level[is_known]
+    counts = np.bincount(entry, minlength=shape[0] * N_LEVELS).reshape(shape)
     total = np.zeros((len(blocks), N_LEVELS), dtype=np.int64)
     for step in (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel():
         total += counts[block_to_row[blocks + step]]
-    total[:, of_frame] += window.prior
-    result: IntArray = _level_at(total, window.share)[own]
+    total[:, prior_level] += window.prior
+    result: IntArray = level_at(total, window.share)[own]
     return result
 
 
-def _level_at(counts: IntArray, share: float) -> IntArray:
+def level_at(counts: IntArray, share: float) -> IntArray:
     """Level that a `share` of the tiles of each row does not exceed.
 
     `counts`, (R, levels), are the numbers of tiles by level.

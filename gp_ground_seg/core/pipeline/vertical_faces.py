@@ -1,18 +1,40 @@
-"""Stage 3: vertical faces (walls, fences, sides of cars) by the scatter of their returns.
+"""Stage 3: what is no ground by the scatter of its returns: vertical faces, plants and stairs.
 
 A band about the ground cannot separate the base of a wall from the ground before it. The
 returns above the base can: together they form a vertical surface. The base of a face is
 occluded where something stands before it, or where the rings of the sensor miss the strip of
 ground in its tile; the lowest return of the tile then belongs to the face.
+
+Land is smooth: the returns of a tile lie on a plane. Those of a bush or of stairs do not. Raised
+tiles among which many scatter, more than the own level does, show no ground either.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from gp_ground_seg.core.frame import OUTSIDE, Faces, FloatArray, IntArray, Scan, Values, as_index
+from gp_ground_seg.core.frame import (
+    OUTSIDE,
+    BoolArray,
+    CellArray,
+    Faces,
+    FloatArray,
+    IntArray,
+    Scan,
+    Values,
+    as_index,
+)
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, FacesConfig, LabelConfig
+from gp_ground_seg.core.pipeline.roughness import (
+    N_LEVELS,
+    ROUGHNESS,
+    SQUARE_EDGES,
+    UNKNOWN_LEVEL,
+    Window,
+    level_at,
+    levels_about,
+)
 
 MIN_RETURNS = 4
 """Returns that a tile needs to have an orientation."""
@@ -24,22 +46,41 @@ UNITS_PER_METRE = 2.0**16
 hundred thousand of them, are then exact, so that their order does not matter."""
 
 
+MIN_WIDTH = 0.05
+"""Least standard deviation of the returns of a tile, in all directions but one, of which the
+scatter about their plane is known [m]: more than that of one ring by noise of its ranges."""
+SCATTER = 0.25 * ROUGHNESS
+SQUARE_SCATTERS = SQUARE_EDGES / 16.0
+"""Scatter about a plane of each level of `gp_ground_seg.core.pipeline.roughness`, and the squares
+between them [m, m^2]."""
+UNKNOWN = -1.0
+"""Square of a scatter that is not known [m^2]."""
+SCATTERED = Window(2, 0.75, 4)
+"""Window of the raised tiles among which many may scatter: of 6 m, for tiles of 0.5 m."""
+SMOOTH, TIMES_OWN, OWN_SHARE = 0.025, 4.0, 0.75
+"""Scatter up to which land is smooth [m]: terrain of KITTI has 0.003 to 0.02, beds and stairs 0.03
+to 0.06; what it may be as a multiple of that of the own level, of which this share is smoother."""
+SAMPLED = 2
+"""One in so many tiles of the own level tells how much it scatters."""
+
 SUMS = 10
 """Rows of the sums over returns: number, x, y, z, their squares, x y, x z, y z."""
 
 
-def find_faces(scan: Scan, config: Config) -> Faces:
-    """Find the tiles that hold a vertical face.
+def find_faces(scan: Scan, height: float, config: Config) -> Faces:
+    """Find the tiles that hold a vertical face, or are of a plant or stairs; those show no ground.
 
-    A tile is examined if a return lies more than `face_height` above the lowest. The scatter of
-    its returns determines their orientation, see `normal_z`; those higher than
-    ``label.obstacle_max_height`` above the lowest may overhang, and are left out.
+    The scatter of the returns of a tile determines their orientation, see `normal_z`; those higher
+    than ``label.obstacle_max_height`` above the lowest may overhang, and are left out. The own
+    level is `height` [m] below the origin.
     """
     tiles, faces, label = scan.tiles, config.faces, config.label
     result, n_sides = Faces.none(tiles), tiles.n_sides
     lowest_z, highest_z = tiles.extremes.astype(np.float64).T
     # Most returns are in tiles where nothing stands, and are left out.
-    tall = np.flatnonzero(highest_z - lowest_z > face_height(label))
+    extent, over = highest_z - lowest_z, lowest_z + height
+    tall = np.flatnonzero(is_examined(extent, over, tiles.place, label))
+    extent, over = extent[tall], over[tall]
     lowest_z = lowest_z[tall]
     # One more than there are tiles: `OUTSIDE` is the index of the last.
     row_of_tile = np.full(len(result.is_face), OUTSIDE)
@@ -64,7 +105,51 @@ def find_faces(scan: Scan, config: Config) -> Faces:
     reaches[row[above > face_height(label)]] = True
     result.is_face[tall] = reaches & is_vertical(foot, rest, faces)
     result.has_occluded_base[tall] = result.is_face[tall] & is_base_occluded(foot, rest, faces)
+    square = np.where(result.is_face[tall], UNKNOWN, scatter_square(foot, rest))
+    rough = tall[_scattered(tiles.place[tall], n_sides, square, extent, over, label)]
+    result.is_face[rough] = result.has_occluded_base[rough] = True
     return result
+
+
+def _scattered(
+    place: CellArray,
+    n_sides: int,
+    square: FloatArray,
+    extent: FloatArray,
+    over: FloatArray,
+    label: LabelConfig,
+) -> BoolArray:
+    """Which tiles at a `place` (K,) are raised, with many about them that scatter, (K,).
+
+    `square` (K,) is that of their scatter, or `UNKNOWN`; for the others see `is_examined`.
+    """
+    is_known, face = square != UNKNOWN, face_height(label)
+    level = np.searchsorted(SQUARE_SCATTERS, square, side='right')
+    is_own = is_known & (np.abs(over) < 0.5 * face) & (extent <= face)
+    counts = np.bincount(level[is_own], minlength=N_LEVELS)
+    own = SCATTER[level_at(counts[None, :], OWN_SHARE)[0]]
+    level[~(is_known & (over > 0.5 * face))] = UNKNOWN_LEVEL
+    about = SCATTER[levels_about(place, level, n_sides, SCATTERED, 0)]
+    result: BoolArray = (level != UNKNOWN_LEVEL) & (over > face) & (about > smooth_up_to(own))
+    return result
+
+
+@shared
+def is_examined(extent: Values, over: Values, place: Values, label: LabelConfig) -> Values:
+    """Whether the scatter of a tile matters.
+
+    Its highest return is `extent` above the lowest, and that is `over` the own level [m]: it is
+    tall, or raised, or tells with others how much the own level scatters.
+    """
+    face = face_height(label)
+    is_sample = (place % SAMPLED == 0) & (over > -0.5 * face)
+    return (extent > face) | (over > 0.5 * face) | is_sample
+
+
+@shared
+def smooth_up_to(own: Values) -> Values:
+    """Largest scatter of smooth land, where the own level has `own` [m]."""
+    return np.maximum(SMOOTH, TIMES_OWN * own)
 
 
 @shared
@@ -90,11 +175,11 @@ def _sums(x: FloatArray, y: FloatArray, z: FloatArray, row: IntArray, n_rows: in
 
 
 @shared
-def is_vertical(foot: FloatArray, rest: FloatArray, faces: FacesConfig) -> Values:
-    """Whether the returns of a tile form a vertical face.
+def moments(foot: FloatArray, rest: FloatArray) -> tuple[Values, ...]:
+    """Return the number of returns, and that times their scatter xx, yy, zz, xy, xz, yz [m^2].
 
-    `foot` and `rest` are the sums over its lowest returns and over those above, (SUMS,), or
-    (SUMS, T) of T tiles; coordinates are relative to any point of the tile [m].
+    `foot` and `rest` are the sums over the lowest returns of a tile and those above, (SUMS,),
+    or (SUMS, T) of T tiles; coordinates are relative to any point of the tile [m].
     """
     n, x, y, z = foot[0] + rest[0], foot[1] + rest[1], foot[2] + rest[2], foot[3] + rest[3]
     xx = foot[4] + rest[4] - x * x / n
@@ -103,7 +188,32 @@ def is_vertical(foot: FloatArray, rest: FloatArray, faces: FacesConfig) -> Value
     xy = foot[7] + rest[7] - x * y / n
     xz = foot[8] + rest[8] - x * z / n
     yz = foot[9] + rest[9] - y * z / n
+    return n, xx, yy, zz, xy, xz, yz
+
+
+@shared
+def is_vertical(foot: FloatArray, rest: FloatArray, faces: FacesConfig) -> Values:
+    """Whether the returns of a tile form a vertical face; for the sums see `moments`."""
+    n, xx, yy, zz, xy, xz, yz = moments(foot, rest)
     return (n >= MIN_RETURNS) & (normal_z(xx, yy, zz, xy, xz, yz) < faces.max_normal_z)
+
+
+@shared
+def scatter_square(foot: FloatArray, rest: FloatArray) -> Values:
+    """Mean square of the returns of a tile about the plane through them [m^2].
+
+    It is the determinant of their scatter over the sum of its minors: nearly the least eigenvalue,
+    as the two others are larger. `UNKNOWN` of few returns, and of those in a line.
+    For the sums see `moments`.
+    """
+    n, xx, yy, zz, xy, xz, yz = moments(foot, rest)
+    a, b, c = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
+    minors = a + b + c
+    determinant = xx * a - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    is_wide = minors > n * MIN_WIDTH * MIN_WIDTH * (xx + yy + zz)
+    is_known = is_wide & (n >= MIN_RETURNS)
+    square = np.maximum(determinant, 0.0) / (n * choose(is_known, minors, 1.0))
+    return choose(is_known, square, UNKNOWN)
 
 
 @shared
