@@ -67,18 +67,33 @@ def lowest_of_cells(scan, config):
 # Vertical faces
 
 
-def find_faces(scan, config):
-    """Tall tiles whose returns have a level normal; of those, faces down to the lowest return."""
+def find_faces(scan, height, config):
+    """Tall tiles whose returns have a level normal; of those, faces down to the lowest return.
+
+    And raised tiles among which many scatter.
+    """
     faces, label = config.faces, config.label
     limit, least = label.obstacle_max_height, label.obstacle_min_height + label.ground_tolerance
-    result = Faces.none(scan.tiles)
+    result, scatter, owned = Faces.none(scan.tiles), {}, []
     for t in np.unique(scan.tiles.tile[scan.tiles.tile >= 0]):
         own = scan.xyz[scan.tiles.tile == t].astype(np.float64)
         above = own[:, 2] - own[:, 2].min()
         own, above = own[above <= limit], above[above <= limit]
-        if len(own) < 4 or above.max() <= least:
+        if len(own) < 4:
             continue
-        value, vector = np.linalg.eigh(np.cov(own.T))
+        value, vector = np.linalg.eigh(np.cov(own.T, ddof=0))
+        lowest, highest = (float(z) + height for z in scan.tiles.extremes[t])
+        minors = value[0] * value[1] + value[0] * value[2] + value[1] * value[2]
+        if minors > 0.05**2 * value.sum():
+            spread = math.sqrt(max(value.prod(), 0.0) / minors)
+            if lowest > 0.5 * least:
+                scatter[t] = spread
+            elif (
+                lowest > -0.5 * least and highest - lowest <= least and not scan.tiles.place[t] % 2
+            ):
+                owned.append(level_of(4.0 * spread))
+        if above.max() <= least:
+            continue
         # Each eigenvector is a normal with the product of the other two eigenvalues.
         weight = np.array([value[1] * value[2], value[0] * value[2], value[0] * value[1]])
         weight = np.maximum(weight, 0.0)
@@ -86,6 +101,12 @@ def find_faces(scan, config):
         square = (weight * vector[2] ** 2).sum() / weight.sum() if is_wide else 1.0
         result.is_face[t] = math.sqrt(square) < faces.max_normal_z
         result.has_occluded_base[t] = result.is_face[t] and _is_occluded(own, above, config)
+    level = {t: level_of(4.0 * x) for t, x in scatter.items() if not result.is_face[t]}
+    own = LEVELS[sorted(owned)[int(0.75 * (len(owned) - 1))] if owned else 0]
+    for t in level:
+        about = LEVELS[level_about(scan.tiles, level, t, 4, 0.75, 4 * [0])] / 4.0
+        if scan.tiles.extremes[t, 0] + height > least and about > max(0.025, own):
+            result.is_face[t] = result.has_occluded_base[t] = True
     return result
 
 
@@ -222,13 +243,15 @@ def label_points(scan, faces, surface, relief, config):
     near = grid.inside & (height < 0.5) & (height >= -0.5)
     rough = ground_roughness(scan.tiles, height, near & ~is_face)
     for i in np.flatnonzero(grid.inside):
-        roughness = rough.get(scan.tiles.tile[i], 0.0)
+        by_roughness = label.rule == 'roughness'
+        roughness = rough.get(scan.tiles.tile[i], 0.0) if by_roughness else 0.0
         band, depth = label.ground_tolerance, label.ground_tolerance
         if label.rule == 'roughness':
             band, depth = max(min(2.1 * roughness, 0.5), band), label.obstacle_max_height
         margin[i] = min(band - height[i], height[i] + depth)
         if is_face[i]:
-            limit = 0.5 * label.ground_tolerance * (-1.0 if is_occluded[i] else 1.0)
+            limit = max(0.5 * label.ground_tolerance, min(2.1 * roughness, 0.05))
+            limit *= -1.0 if is_occluded[i] else 1.0
             lowest = float(scan.tiles.lowest_z[scan.tiles.tile[i]])
             margin[i] = min(margin[i], limit - (float(scan.xyz[i, 2]) - lowest))
     if label.rule == 'roughness':
@@ -238,35 +261,46 @@ def label_points(scan, faces, surface, relief, config):
 
 
 def ground_roughness(tiles, height, counted):
-    """Roughness of each tile with returns that count, by the tiles in the windows about it."""
-    side = math.isqrt(len(tiles.at))
-    spread = {
-        tile: math.sqrt(np.mean(height[counted & (tiles.tile == tile)] ** 2))
+    """Roughness about each tile, by those in the windows about it with returns that count."""
+    level = {
+        tile: level_of(math.sqrt(np.mean(height[counted & (tiles.tile == tile)] ** 2)))
         for tile in np.unique(tiles.tile[counted])
     }
-    edges = [0.01 * 1.14**k for k in range(31)]
-    # Levels are 14 % apart, and as rough as the middle of theirs.
-    value = [0.01, *(edge * math.sqrt(1.14) for edge in edges)]
-    level = {tile: sum(rms >= edge for edge in edges) for tile, rms in spread.items()}
     if not level:
         return {}
     median = sorted(level.values())[(len(level) - 1) // 2]
+    return {
+        tile: min(
+            LEVELS[level_about(tiles, level, tile, 2, 0.8, 4 * [median])],
+            3.4 * LEVELS[level_about(tiles, level, tile, 4, 0.5, 16 * [median])],
+        )
+        for tile in range(len(tiles.place))
+    }
 
-    def about(tile, size, share, prior):
-        """Level that a share of the tiles in 3 x 3 blocks of a size does not exceed."""
-        block = [place // size for place in divmod(int(tiles.place[tile]), side)]
-        beside = [
-            found
-            for other, found in level.items()
-            if all(
-                abs(place // size - own) <= 1
-                for place, own in zip(divmod(int(tiles.place[other]), side), block, strict=True)
-            )
-        ]
-        ranked = sorted([*beside, *[median] * prior])
-        return value[ranked[int(share * (len(ranked) - 1))]]
 
-    return {tile: min(about(tile, 2, 0.8, 4), 3.4 * about(tile, 4, 0.5, 16)) for tile in level}
+EDGES = [0.01 * 1.14**k for k in range(31)]
+LEVELS = [0.01, *(edge * math.sqrt(1.14) for edge in EDGES)]
+"""Levels are 14 % apart, and as rough as the middle of theirs."""
+
+
+def level_of(rms):
+    return sum(rms >= edge for edge in EDGES)
+
+
+def level_about(tiles, level, tile, size, share, prior):
+    """Level that a share of the tiles in 3 x 3 blocks, and the prior, does not exceed."""
+    side = math.isqrt(len(tiles.at))
+    block = [place // size for place in divmod(int(tiles.place[tile]), side)]
+    beside = [
+        found
+        for other, found in level.items()
+        if all(
+            abs(place // size - own) <= 1
+            for place, own in zip(divmod(int(tiles.place[other]), side), block, strict=True)
+        )
+    ]
+    ranked = sorted([*beside, *prior])
+    return ranked[int(share * (len(ranked) - 1))]
 
 
 def settle(scan, surface, margin, near, label):

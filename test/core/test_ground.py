@@ -18,7 +18,7 @@ TOLERANCES = {'numpy': (1e-9, 1e-7, 1e-5), 'numba': (1e-5, 1e-5, 1e-5)}
 
 def frame_of(xyz, config):
     scan = NumpyBackend().build_grid(np.asarray(xyz, dtype=float), config)
-    faces = NumpyBackend().find_faces(scan, config)
+    faces = NumpyBackend().find_faces(scan, 1.73, config)
     found = NumpyBackend().extract_lines(scan.candidates, faces, config)
     return Frame(*found, scan.grid.edges, prior_mean=-1.73)
 

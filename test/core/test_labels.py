@@ -91,7 +91,7 @@ def test_labels_are_the_reference(backend, seed, dtype):
     mean[seed % 4] = std[seed % 4] = np.nan
     surface = GroundSurface(KNOTS, mean, std, np.ones(0, dtype=bool))
     scan: Scan = backend.build_grid(xyz, CONFIG)
-    faces = backend.find_faces(scan, CONFIG)
+    faces = backend.find_faces(scan, 0.0, CONFIG)
     assert faces.is_face.any()
     found = backend.label_points(scan, faces, surface, LEVEL, CONFIG)
     height = scan.xyz[:, 2] - at_points(KNOTS, mean, scan.grid)

@@ -14,11 +14,11 @@ CORNER = np.array([10.0, 5.0, 0.0])
 """Corner of the tile that the clouds below lie in."""
 
 
-def faces_of(backend, xyz, **changes):
+def faces_of(backend, xyz, height=0.0, **changes):
     """Whether each point lies on a face, and on one with occluded base; and the scan."""
     config = BASE.replace(**{f'faces.{name}': value for name, value in changes.items()})
     scan = backend.build_grid(np.asarray(xyz, dtype=float), config)
-    faces, tile = backend.find_faces(scan, config), np.maximum(scan.tiles.tile, 0)
+    faces, tile = backend.find_faces(scan, height, config), np.maximum(scan.tiles.tile, 0)
     inside = scan.tiles.tile != OUTSIDE
     return faces.is_face[tile] & inside, faces.has_occluded_base[tile] & inside, scan
 
@@ -72,7 +72,39 @@ def test_faces_are_the_reference(backend, seed, dtype):
         **{'faces.max_foot_distance': rng.uniform(0.02, 0.2), 'faces.max_normal_z': limit}
     )
     scan = backend.build_grid(xyz.astype(dtype), config)
-    found, expected = backend.find_faces(scan, config), find_faces(scan, config)
+    height = (0.0, 0.5, 1.0)[seed % 3]
+    found = backend.find_faces(scan, height, config)
+    expected = find_faces(scan, height, config)
     np.testing.assert_array_equal(found.is_face, expected.is_face)
     np.testing.assert_array_equal(found.has_occluded_base, expected.has_occluded_base)
-    assert found.is_face.any() == (limit > 0.0)
+    assert found.is_face.any() or limit == 0.0
+
+
+def patch(y, height, noise, rise=0.0):
+    """Returns on 2 by 2 m from y on, at a height with noise, and steps of a rise along x."""
+    rng = np.random.default_rng(8)
+    x, z = rng.uniform(0.0, 2.0, 800), height + rng.normal(0.0, noise, 800)
+    return np.stack([x, rng.uniform(y, y + 2.0, 800), z + rise * np.floor(x / 0.3)], axis=-1)
+
+
+@pytest.mark.parametrize(
+    ('what', 'shows_none'),
+    [
+        ((0.6, 0.04, 0.0), True),  # a bush
+        ((0.6, 0.01, 0.0), False),  # a bank
+        ((0.6, 0.0, 0.16), True),  # stairs
+        ((0.2, 0.04, 0.0), False),  # tall grass
+        ((-0.6, 0.04, 0.0), False),  # a bed below the own level
+    ],
+)
+def test_raised_tiles_that_scatter_show_no_ground(backend, what, shows_none):
+    height, noise, rise = what
+    level, raised = patch(0.0, 0.0, 0.005), patch(6.0, height, noise, rise)
+    _, is_occluded, _ = faces_of(backend, np.vstack([level, raised]))
+    assert not is_occluded[: len(level)].any()
+    assert is_occluded[len(level) :].mean() > 0.9 if shows_none else not is_occluded.any()
+
+
+def test_land_may_scatter_as_the_own_level_does(backend):
+    meadow = np.vstack([patch(0.0, 0.0, 0.03), patch(6.0, 0.6, 0.04)])
+    assert not faces_of(backend, meadow)[1].any()
