@@ -312,7 +312,7 @@ def _is_mirrored(returns: _Returns, upper: IntArray) -> BoolArray:
     seen = np.sort(place[on_road])
     is_level = z[before] > z[upper] - ON_LEVEL
     begin = MARGIN * r[np.where(is_level, before, upper)] + 0.05
-    end = r[upper + 1] / MARGIN - 0.05
+    end = r[upper + 1] / MARGIN - 0.15
     first, stop = (np.searchsorted(seen, start[upper] + place) for place in (begin, end))
     result: BoolArray = stop > first
     return result | ((r[before] > begin) & (z[before] < z[upper + 1] - ON_LEVEL))
