@@ -7,9 +7,10 @@ equal sectors, counter-clockwise from -x.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +29,7 @@ from gp_ground_seg.core.parameters.config import ANY_HEIGHT, Config
 from gp_ground_seg.core.pipeline.sensor_pose import LEAST_COSINE
 from gp_ground_seg.core.result import Segmentation, cached_property
 from gp_ground_seg.data.point_cloud2 import read_xyz
-from gp_ground_seg.data.step_edges import find_edges
+from gp_ground_seg.data.step_edges import SECTORS, Edges, across_sectors, find_edges
 
 DIRECTIONS = 720
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -40,6 +41,20 @@ _ROWS = 32  # rows of cells at a time: their arrays stay in the cache
 
 Ranges = npt.NDArray[np.float32]
 Places = tuple[PointArray, PointArray]
+
+
+class _XY(NamedTuple):
+    x: PointArray
+    y: PointArray
+
+
+class Blocked(_XY):
+    """Places that are in the way, and what falls of the ground hide: no evidence is never free."""
+
+    hides: Callable[[FloatArray, FloatArray], BoolArray]  # whether places are behind falls
+    # (DIRECTIONS,) range of the first return, and of any, if it is behind a fall [m]
+    first: Ranges
+    behind: Ranges
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,10 +110,21 @@ class SegmentedCloud:
 
     @cached_property
     def blocked(self) -> Places:
-        """Places of the obstacles, and of edges of drops if ``output.max_step_down`` is not 0."""
-        both = zip(self.places(self.is_obstacle), self._in_plane(*self.edges.T), strict=True)
-        x, y = (np.concatenate([a, b.astype(a.dtype)]) for a, b in both)
-        return x, y
+        """Places of the obstacles, and `Blocked` if ``output.max_step_down`` is not 0."""
+        if self.config.output.max_step_down == 0.0:
+            return self.places(self.is_obstacle)
+        edges, pose, heading = self._found, self.segmentation.pose, self.heading
+        stands = self.places(self.is_obstacle & ~edges.is_before)
+        both = zip(stands, self._in_plane(*self.edges.T), strict=True)
+        blocked = Blocked(*(np.concatenate([a, b.astype(a.dtype)]) for a, b in both))
+        ahead, left, _ = pose.origin
+        blocked.hides = lambda x, y: edges.hides(*(heading @ np.stack([x - ahead, y - left])))
+        level = np.full(SECTORS, -pose.sensor_height)
+        blocked.first, blocked.behind = (
+            ranges_of(*self._in_plane(*self._in_cloud(across_sectors(r, level)).T))[0]
+            for r in (edges.first, edges.behind)
+        )
+        return blocked
 
     @cached_property
     def edges(self) -> FloatArray:
@@ -106,18 +132,26 @@ class SegmentedCloud:
 
         Where ``output.max_step_down`` is 0, none are looked for.
         """
-        output, found = self.config.output, self.segmentation
-        if output.max_step_down == 0.0:
+        if self.config.output.max_step_down == 0.0:
             return np.empty((0, 3))
+        return self._in_cloud(self._found.points())
+
+    @cached_property
+    def _found(self) -> Edges:
+        found = self.segmentation
         # What lies below the surface does not stand on it, and tells how deep a drop is.
         stands = (found.label == _OBSTACLE) & ~(found.labelled.height < 0.0)
         # Rays begin at the sensor, which is not the origin of a cloud in the frame of a vehicle.
-        origin = np.array(found.pose.origin)
         with np.errstate(over='ignore', invalid='ignore'):
-            xyz = (self.points - origin) @ found.pose.rotation.T
+            xyz = (self.points - np.array(found.pose.origin)) @ found.pose.rotation.T
         xyz[found.grid.cell == NOT_FINITE] = np.nan
-        edges = find_edges(xyz, self.is_ground, stands, output.max_step_down)
-        return np.asarray(edges.points() @ found.pose.rotation + origin)
+        limit, height = self.config.output.max_step_down, found.pose.sensor_height
+        return find_edges(xyz, self.is_ground, stands, limit, height)
+
+    def _in_cloud(self, level: FloatArray) -> FloatArray:
+        """Points of the level frame about the sensor in the frame of the cloud, (n, 3) [m]."""
+        pose = self.segmentation.pose
+        return np.asarray(level @ pose.rotation + np.array(pose.origin))
 
     def _in_plane(self, x: PointArray, y: PointArray, z: PointArray) -> Places:
         """Places of points of the cloud, (n,) each, as `places` gives them."""
@@ -164,12 +198,17 @@ def ranges_of(x: PointArray, y: PointArray) -> tuple[Ranges, Ranges]:
 def scan_ranges(obstacles: Places, returns: Places) -> Ranges:
     """Range of the nearest of the `obstacles` in each direction [m], (DIRECTIONS,).
 
-    Infinite where there are other `returns` only, NaN where there is no return at all.
+    Infinite where there are other `returns` only, NaN where there is no return at all. With
+    `Blocked` also NaN behind a first return below a fall, and instead of infinite behind any fall.
     """
     ranges, _ = ranges_of(*obstacles)
     is_seen = np.isfinite(ranges)
     is_seen[direction_of(*returns)] = True
     ranges[~is_seen] = np.nan
+    if isinstance(obstacles, Blocked):
+        ranges[(ranges > obstacles.first) | (np.isinf(ranges) & (obstacles.behind < np.inf))] = (
+            np.nan
+        )
     return ranges
 
 
@@ -193,7 +232,8 @@ def occupancy(
 
     A cell with an obstacle is `OCCUPIED`. One with a ground return is `FREE`, and so is one
     between the nearest and the farthest ground return of its direction, before the nearest
-    obstacle and within `reach`, (DIRECTIONS,) [m]. All others are `UNKNOWN`.
+    obstacle and within `reach`, (DIRECTIONS,) [m]. All others are `UNKNOWN`, and so
+    is what `Blocked` hides.
     """
     n_cells = math.ceil(grid_size / cell_size - 1e-6)
     state = np.full((n_cells, n_cells), UNKNOWN, dtype=np.int8)
@@ -214,7 +254,12 @@ def occupancy(
             for along in places
         )
         bordered[row.astype(np.int32), column.astype(np.int32)] = value
-    return np.ascontiguousarray(bordered[1:-1, 1:-1])
+    state = np.ascontiguousarray(bordered[1:-1, 1:-1])
+    if isinstance(obstacles, Blocked):
+        cells = np.argwhere(state == FREE)
+        y, x = (cells.T + 0.5 * (1 - n_cells)) * cell_size
+        state[tuple(cells[obstacles.hides(x, y)].T)] = UNKNOWN
+    return state
 
 
 @lru_cache(maxsize=2)

@@ -1,16 +1,14 @@
 """Edges of drops: where the ground steps down by more than a robot can take.
 
 Behind an edge with a drop of depth D at range r, a sensor at height h sees the lower ground from
-``r (h + D) / h`` on. Nothing between is seen, and the surface there is interpolated, no steeper
-than the line of sight over the edge: at 10 m from 1.73 m, 10 degrees. So its slope does not tell
-a drop from a ramp. The returns do. On a ramp that is less steep than the line of sight they
-come all along the descent; at a drop two returns that follow each other in elevation have the
-whole step between them, and the ground is level before and behind.
+``r (h + D) / h`` on. Nothing between is seen, and the surface there is interpolated. A fall is
+such a pair of returns that follow each other in elevation, in one sector of azimuth. The first of
+a sector is the ground that the robot stands on: the last drop before it is a fall, too.
 
-A step is such a pair in one sector of azimuth. Steps of neighbouring sectors are one edge, and it
-is one only if three things hold. The fall stands out from the roughness of the ground on both
-sides. Planes through the ground before and behind, carried on to the other side, leave a fall:
-the one behind goes up to the edge of a long ramp. And few of the steps go on as a descent.
+No slope explains a fall if the ground before and behind it does not go down, and if it stands out
+from the roughness of both. What lies behind is not known to be on the level of the robot: it is a
+drop, or a ramp at least as steep as the line of sight over the edge. It is a drop if neighbouring
+sectors have the edge, and lines of sight over it are steeper than a ramp.
 """
 
 from __future__ import annotations
@@ -19,6 +17,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray
 from gp_ground_seg.core.ground_model import segment_of
@@ -30,7 +29,7 @@ LEVEL, N_LEVELS = math.radians(0.1), 1 << 10
 NEAREST, FARTHEST, REACH = 0.3, 150.0, 20.0
 """Least and greatest range of a return, and greatest range of an edge [m]: beyond, rings are too
 far apart to tell a drop from a descent."""
-LEAST_SHARE = 0.4
+LEAST_SHARE = 0.3
 """Least slope between the two returns of a step, as a share of the slope of the line of sight.
 With a smaller one, the rings are farther apart than the part that the edge hides."""
 MARGIN = 1.02
@@ -49,9 +48,9 @@ WINDOWS = 2.0, 3.0, 4.5, 6.75, 10.0
 ON_SLOPE, MIN_DESCENT, MAX_ON_SLOPE = 0.35, 0.02, 0.2
 """A step is part of a descent if the ground before or behind it has at least this share of its
 slope; least descent to the next ring behind [m]; largest share of such steps in an edge."""
-NEXT_RINGS = 0.97, 0.85, 0.7
-"""The slope behind a step is that to the returns whose lines of sight have these shares of the
-slope of the line of sight at the step."""
+NEXT_RING = 0.97
+"""The slope behind a step is that to the return whose line of sight has this share of the slope of
+the line of sight at the step."""
 
 MAX_APART, SAME_EDGE = 3, 0.12
 """Most sectors from one step of an edge to the next, and the share of its range by which the edge
@@ -59,26 +58,51 @@ may recede from sector to sector."""
 MIN_STEPS, MIN_WIDTH, MIN_STRONG = 3, 1.0, 0.25
 """Least number of steps of an edge, least width [m], and least share of steps that are larger than
 the largest allowed one."""
-PLANE_STD, SLOPE_STD, N_STD = 0.05, 0.15, 2.0
-"""Standard deviations of heights about a plane [m] and, before any ground is seen, of its slope;
-a drop is certain if it is larger than this many standard deviations of the plane."""
+STEEPEST, SHALLOWER = 0.21, 0.85
+"""A line of sight over an edge tells a drop from a ramp if it is steeper than this slope, of the
+steepest ramp that robots drive, or than this share of the lowest one of the sensor."""
+LEAST_FALL, LEAST_HIDDEN = 0.02, 0.3
+"""Least fall that hides ground, and least length of what is hidden [m]."""
+FOOT = 0.01
+"""Range of the ground that the robot stands on [m]."""
+MAX_SLOPE = 0.3
+"""Steepest slope that is seen to lead down from the robot."""
+ON_LEVEL = 0.1
+"""What is nearer to the level of the robot before a fall is ground, whatever its label [m]."""
+BIN, N_BINS = 0.1, 500
+"""Width and number of the bins of range in which ground is hidden [m]."""
 SAMPLES, SPACING = 8, 0.04
 """Points along an edge in a sector, and their distance along the line between two of them [m]: at
 `REACH` both are closer than the smallest cells of a map."""
 
 
 class Edges(NamedTuple):
-    """Nearest edge in each sector."""
+    """Nearest edge in each sector, and what no return tells to be on the level of the robot."""
 
     r: FloatArray  # (SECTORS,) range of the last ground before it [m]; infinite without one
     z: FloatArray  # (SECTORS,) height of that ground [m]; NaN without one
     goes_on: BoolArray  # (SECTORS,) whether it goes on in the next sector
+    first: FloatArray  # (SECTORS,) range of the first return if it is behind a fall [m]
+    behind: FloatArray  # (SECTORS,) range of the nearest return behind a fall [m]
+    hidden: BoolArray  # (SECTORS, N_BINS) bins of range behind falls
+    is_before: BoolArray  # (N,) returns of the level of the robot before falls
+
+    @classmethod
+    def none(cls, n_points: int) -> Edges:
+        """Where the ground goes on in all directions."""
+        r, first, behind = np.full((3, SECTORS), np.inf)
+        shapes = SECTORS, (SECTORS, N_BINS), n_points
+        goes_on, *masks = (np.zeros(shape, dtype=np.bool_) for shape in shapes)
+        return cls(r, np.full(SECTORS, np.nan), goes_on, first, behind, *masks)
+
+    def hides(self, x: FloatArray, y: FloatArray) -> BoolArray:
+        """Whether places are behind falls."""
+        bins = np.minimum(np.hypot(x, y) / BIN, N_BINS - 1).astype(np.int64)
+        result: BoolArray = self.hidden[segment_of(x, y, SECTORS), bins]
+        return result
 
     def points(self) -> FloatArray:
         """Points along the edges, closer to each other than cells of a map are, (n, 3) [m]."""
-        sector = np.flatnonzero(np.isfinite(self.r))
-        across = np.repeat(sector, SAMPLES)
-        turn = across + np.tile((np.arange(SAMPLES) + 0.5) / SAMPLES, len(sector))
         # Where an edge goes on nearer or farther, along the line between the two sectors.
         before = np.flatnonzero(self.goes_on)
         jump = self.r[(before + 1) % SECTORS] - self.r[before]
@@ -86,23 +110,32 @@ class Edges(NamedTuple):
         along, jump = np.repeat(before, number), np.repeat(jump, number)
         first = np.repeat(np.cumsum(number) - number, number)
         moved = (np.arange(len(along)) - first + 1.0) * np.copysign(SPACING, jump)
+        ends = _place(along + 1.0, self.r[along] + moved, self.z[along])
+        return np.concatenate([across_sectors(self.r, self.z), ends])
 
-        azimuth = np.append(turn, along + 1.0) * (2.0 * math.pi / SECTORS) - math.pi
-        r = np.append(self.r[across], self.r[along] + moved)
-        z = np.append(self.z[across], self.z[along])
-        return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], axis=-1)
+
+def across_sectors(r: FloatArray, z: FloatArray) -> FloatArray:
+    """Points across the sectors at ranges `r`, (SECTORS,), where they are finite, (n, 3) [m]."""
+    sector = np.repeat(np.flatnonzero(np.isfinite(r)), SAMPLES)
+    turn = sector + (np.arange(len(sector)) % SAMPLES + 0.5) / SAMPLES
+    return _place(turn, r[sector], z[sector])
+
+
+def _place(turn: npt.NDArray[np.floating], r: FloatArray, z: FloatArray) -> FloatArray:
+    """Points at azimuths in sectors from -x, (n, 3) [m]."""
+    azimuth = turn * (2.0 * math.pi / SECTORS) - math.pi
+    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], axis=-1)
 
 
 class _Returns(NamedTuple):
     """Returns below the sensor, by sector, and in it from the lowest elevation up."""
 
+    point: IntArray  # (n,) in the input; beyond it for the ground that the robot stands on
     key: IntArray  # (n,) ``sector * N_LEVELS`` + step of elevation
     sector: IntArray  # (n,)
-    xyz: FloatArray  # (3, n) [m]
     r: FloatArray  # (n,) horizontal range [m]
     is_ground: BoolArray  # (n,)
     n_standing: IntArray  # (n + 1,) how many before each stand on the ground
-
     z: FloatArray  # (n,) height [m]
     sight: FloatArray  # (n,) downward slope of the line of sight
 
@@ -113,17 +146,17 @@ class _Steps(NamedTuple):
     upper: IntArray  # (S,) last return before the step
     lower: IntArray  # (S,) first return behind it
     fall: FloatArray  # (S,) height that the ground falls, less its roughness [m]
-    before: FloatArray  # (3, S) mean place of the ground before the step [m]
+    is_steep: BoolArray  # (S,) whether the line of sight is steeper than a ramp
     is_on_slope: BoolArray  # (S,) whether the ground goes down before or behind it
 
     def where(self, kept: IntArray | BoolArray) -> _Steps:
         """Those of an index or a mask."""
-        taken: list[Any] = [values[..., kept] for values in self]
+        taken: list[Any] = [values[kept] for values in self]
         return _Steps(*taken)
 
 
 def find_edges(
-    xyz: FloatArray, is_ground: BoolArray, stands: BoolArray, max_step_down: float
+    xyz: FloatArray, is_ground: BoolArray, stands: BoolArray, max_step_down: float, height: float
 ) -> Edges:
     """Find where the ground steps down by more than `max_step_down`.
 
@@ -137,19 +170,22 @@ def find_edges(
         Points of what stands on the ground: it hides ground without being a drop.
     max_step_down : float
         Largest step that is none [m].
+    height : float
+        Of the sensor over the ground that the robot stands on [m].
 
     Returns
     -------
     Edges
         In each sector the range up to which the ground is seen to go on before its nearest edge.
     """
-    nowhere = np.zeros(SECTORS, dtype=np.bool_)
-    edges = Edges(np.full(SECTORS, np.inf), np.full(SECTORS, np.nan), nowhere)
-    returns = _sort(xyz, is_ground, stands)
-    falls = _falls(returns, WEAK * max_step_down)
-    if len(falls[0]) < MIN_STEPS:
-        return edges
-    steps = _steps(returns, *falls, WEAK * max_step_down)
+    edges = Edges.none(len(xyz))
+    returns = _sort(xyz, is_ground, stands, height)
+    steps = _steps(returns, *_falls(returns), max_step_down)
+    _hide(edges, returns, steps.where(~steps.is_on_slope), max_step_down)
+    steps = steps.where((steps.fall > WEAK * max_step_down) & (returns.r[steps.upper] > FOOT))
+    order = np.lexsort((returns.r[steps.upper], returns.sector[steps.upper]))
+    _, nearest = np.unique(returns.sector[steps.upper[order]], return_index=True)
+    steps = steps.where(order[nearest])
     if len(steps.upper) < MIN_STEPS:
         return edges
     sector, near = returns.sector[steps.upper], returns.r[steps.upper]
@@ -158,7 +194,7 @@ def find_edges(
     gap, group = _group(sector, near, far)
     for number in range(int(group.max()) + 1):
         members = np.flatnonzero(group == number)
-        if not _is_edge(returns, steps.where(members), max_step_down):
+        if not _is_edge(steps.where(members), near[members], max_step_down):
             continue
         for a in members:
             # Up to the next step of the edge, as near as the nearer of the two.
@@ -170,25 +206,47 @@ def find_edges(
     return edges
 
 
-def _sort(xyz: FloatArray, is_ground: BoolArray, stands: BoolArray) -> _Returns:
-    x, y, z = xyz.T
-    r = np.hypot(x, y)
-    kept = np.flatnonzero((r > NEAREST) & (r < FARTHEST) & (z < 0.0) & (z > -FARTHEST))
+def _hide(edges: Edges, returns: _Returns, steps: _Steps, max_step_down: float) -> None:
+    """Enter what lies behind `steps`, which no slope explains, until the level is seen again."""
+    z, r = returns.z, returns.r
+    starts = np.searchsorted(returns.sector, np.arange(SECTORS + 1))
+    for upper, lower in zip(steps.upper, steps.lower, strict=True):
+        sector, depth = returns.sector[upper], z[upper] - z[lower]
+        if depth < LEAST_HIDDEN * returns.sight[lower]:
+            continue
+        start, behind = starts[sector], slice(lower, starts[sector + 1])
+        is_level = abs(z[start : upper + 1] - z[start]) < ON_LEVEL
+        edges.is_before[returns.point[start + 1 : upper + 1]] |= is_level[1:]
+        is_back = returns.is_ground[behind] & (z[behind] > z[upper] - max_step_down)
+        until = r[lower + is_back.argmax()] if is_back.any() else FARTHEST
+        edges.hidden[sector, int(r[upper] / BIN) + 1 : int(until / BIN)] = True
+        if depth > WEAK * max_step_down:
+            nearest = edges.first if r[upper] == FOOT else edges.behind
+            nearest[sector] = min(nearest[sector], r[lower])
+
+
+def _sort(xyz: FloatArray, is_ground: BoolArray, stands: BoolArray, height: float) -> _Returns:
+    foot = _place(np.arange(SECTORS) + 0.5, np.full(SECTORS, FOOT), np.full(SECTORS, -height))
+    x, y, z = np.concatenate([xyz, foot]).T
+    r, is_foot = np.hypot(x, y), np.arange(len(x)) >= len(xyz)
+    r[is_foot] = FOOT
+    kept = np.flatnonzero(((r > NEAREST) | is_foot) & (r < FARTHEST) & (z < 0.0) & (z > -FARTHEST))
     x, y, z, r = (values[kept] for values in (x, y, z, r))
     sector = segment_of(x, y, SECTORS)
     level = ((np.arctan2(z, r) + 0.5 * math.pi) / LEVEL).astype(np.int64)
-    key = sector * N_LEVELS + level
     # In a ring near to far, where the upper ground and the lower have both returns of it.
+    key = sector * N_LEVELS + np.where(is_foot[kept], 0, level)
     order = np.lexsort((r, key))
-    kept = kept[order]
-    n_standing = np.concatenate([[0], np.cumsum(stands[kept])])
-    places, r, z = np.stack([x, y, z])[:, order], r[order], z[order]
-    ground = is_ground[kept]
-    return _Returns(key[order], sector[order], places, r, ground, n_standing, z, -z / r)
+    kept, z, r = kept[order], z[order], r[order]
+    # A surface that goes down behind an edge has the last of the ground before it above it.
+    is_level = abs(z + height) < ON_LEVEL
+    ground, stood = (np.pad(mask, (0, SECTORS))[kept] for mask in (is_ground, stands))
+    n_standing = np.concatenate([[0], np.cumsum(stood & ~is_level)])
+    return _Returns(kept, key[order], sector[order], r, ground | is_level, n_standing, z, -z / r)
 
 
-def _falls(returns: _Returns, least: float) -> tuple[IntArray, FloatArray]:
-    """Last returns of the ground before falls of more than `least` [m], and slopes of the falls.
+def _falls(returns: _Returns) -> tuple[IntArray, FloatArray]:
+    """Last returns of the ground before falls of more than `LEAST_FALL`, and slopes of the falls.
 
     Each ends at the next return. Its slope is positive, and not much less than that of the line of
     sight.
@@ -196,58 +254,68 @@ def _falls(returns: _Returns, least: float) -> tuple[IntArray, FloatArray]:
     sector, z, r = returns.sector, returns.z, returns.r
     stands = np.diff(returns.n_standing) > 0
     is_fall = (sector[1:] == sector[:-1]) & returns.is_ground[:-1] & ~stands[1:]
-    is_fall &= (z[:-1] - z[1:] > least) & (r[1:] > r[:-1]) & (r[:-1] < REACH)
+    is_fall &= (z[:-1] - z[1:] > LEAST_FALL) & (r[1:] > r[:-1]) & (r[:-1] < REACH)
     upper = np.flatnonzero(is_fall)
     slope = (z[upper] - z[upper + 1]) / (r[upper + 1] - r[upper])
-    kept = slope > LEAST_SHARE * returns.sight[upper + 1]
+    kept = (slope > LEAST_SHARE * returns.sight[upper + 1]) | (r[upper] == FOOT)
     if kept.any():
-        kept &= ~_is_mirrored(returns, upper, least)
+        kept &= ~_is_mirrored(returns, upper)
     return upper[kept], slope[kept]
 
 
-def _steps(returns: _Returns, upper: IntArray, slope: FloatArray, least: float) -> _Steps:
-    """Nearest step of each sector: a fall larger than `least` [m] and the roughness allow."""
+def _steps(returns: _Returns, upper: IntArray, slope: FloatArray, max_step_down: float) -> _Steps:
+    """Falls that are larger than the roughness allows, those from the foot than the limit."""
     sector, z, r = returns.sector, returns.z, returns.r
-    lower, ground = upper + 1, _Ground.of(returns)
+    lower, ground, is_first = upper + 1, _Ground.of(returns), r[upper] == FOOT
     begin = (1.0 - BEFORE) * r[upper] - NEAREST
-    before, slope_before, roughness = ground.window(sector[upper], begin, 1.001 * r[upper])
+    middle, level, slope_before, roughness = ground.window(sector[upper], begin, 1.001 * r[upper])
     runs_down = -slope_before >= ON_SLOPE * slope
-    runs_down &= -slope_before * (r[upper] - np.hypot(before[0], before[1])) > roughness
+    runs_down &= -slope_before * (r[upper] - middle) > roughness
     # The far wall of a trench makes one window rough: rough ground makes both so. Where one ring
     # is all that is seen before the step, it tells neither slope nor roughness.
     begin = 1.1 * r[lower] + 0.5
-    _, _, near = ground.window(sector[upper], begin, BEHIND * begin)
-    _, _, far = ground.window(sector[upper], BEHIND * begin, BEHIND**2 * begin)
+    *_, near = ground.window(sector[upper], begin, BEHIND * begin)
+    *_, far = ground.window(sector[upper], BEHIND * begin, BEHIND**2 * begin)
     behind = np.where(slope_before == 0.0, np.maximum(near, far), np.minimum(near, far))
     roughness = np.maximum(np.maximum(roughness, behind), ground.roughness())
-    following, known = _next_ring(returns, lower, NEXT_RINGS[0])
+    following, known = _next_ring(returns, lower, NEXT_RING)
     descent = z[lower] - z[following]
     goes_on = known & (descent >= ON_SLOPE * slope * (r[following] - r[lower]))
     goes_on &= descent > N_ROUGHNESS * roughness + MIN_DESCENT
+    # The first ground that is seen leads back, up to the level of the robot.
+    _, _, seen, _ = ground.window(sector[upper], 0.95 * r[lower], BEHIND**2 * r[lower])
+    leads_back = returns.is_ground[lower] & (seen > -MAX_SLOPE)
+    leads_back &= z[lower] - seen * r[lower] > z[upper] - max_step_down
+    is_on_slope = np.where(is_first, leads_back, runs_down | goes_on)
 
-    fall = np.minimum(z[upper], before[2]) - z[lower] - N_ROUGHNESS * roughness
-    steps = _Steps(upper, lower, fall, before, runs_down | goes_on).where(fall > least)
-    order = np.lexsort((r[steps.upper], sector[steps.upper]))
-    _, first = np.unique(sector[steps.upper[order]], return_index=True)
-    return steps.where(order[first])
+    fall = np.minimum(z[upper], level) - z[lower] - N_ROUGHNESS * roughness
+    fall = np.where(is_first, z[upper] - z[lower], fall)
+    lowest = np.zeros(SECTORS)
+    np.maximum.at(lowest, sector[r > FOOT], returns.sight[r > FOOT])
+    lowest = np.max([np.roll(lowest, aside) for aside in range(-WIDTH, WIDTH + 1)], axis=0)
+    is_steep = returns.sight[lower] > np.minimum(STEEPEST, SHALLOWER * lowest[sector[upper]])
+    steps = _Steps(upper, lower, fall, is_steep, is_on_slope)
+    return steps.where(fall > np.where(is_first, max_step_down, LEAST_FALL))
 
 
-def _is_mirrored(returns: _Returns, upper: IntArray, least: float) -> BoolArray:
+def _is_mirrored(returns: _Returns, upper: IntArray) -> BoolArray:
     """Which steps, by their `upper` returns, are between a wet road and a mirror image below it.
 
     The road, or what stands on it, is then also seen between the two, or a steeper ray has gone
     farther and still deeper.
     """
     r, z, start = returns.r, returns.z, returns.sector * FARTHEST
-    on_road = returns.is_ground | (np.diff(returns.n_standing) > 0)
-    seen = np.sort((start + r)[on_road])
-    begin, end = MARGIN * r[upper] + 0.05, r[upper + 1] / MARGIN - 0.05
-    first, stop = (np.searchsorted(seen, start[upper] + place) for place in (begin, end))
     place = start + r
     farthest = np.where(place == np.maximum.accumulate(place), np.arange(len(r)), 0)
     before = np.maximum.accumulate(farthest)[upper]
+    on_road = returns.is_ground | (np.diff(returns.n_standing) > 0)
+    seen = np.sort(place[on_road])
+    is_level = z[before] > z[upper] - ON_LEVEL
+    begin = MARGIN * r[np.where(is_level, before, upper)] + 0.05
+    end = r[upper + 1] / MARGIN - 0.15
+    first, stop = (np.searchsorted(seen, start[upper] + place) for place in (begin, end))
     result: BoolArray = stop > first
-    return result | ((r[before] > begin) & (z[before] < z[upper + 1] - least))
+    return result | ((r[before] > begin) & (z[before] < z[upper + 1] - ON_LEVEL))
 
 
 def _next_ring(returns: _Returns, index: IntArray, share: float) -> tuple[IntArray, BoolArray]:
@@ -270,29 +338,29 @@ class _Ground(NamedTuple):
     """Sums over the ground returns of each sector, near to far."""
 
     key: FloatArray  # (n,) sector and range
-    sums: FloatArray  # (8, n + 1) of 1, x, y, z, z^2, r, r^2 and r z of those before
+    sums: FloatArray  # (6, n + 1) of 1, z, z^2, r, r^2 and r z of those before
 
     @classmethod
     def of(cls, returns: _Returns) -> _Ground:
         index = np.flatnonzero(returns.is_ground & (returns.r < 5.0 * REACH))
         key = returns.sector[index] * FARTHEST + returns.r[index]
         order = np.argsort(key, kind='stable')
-        (x, y, z), r = returns.xyz[:, index[order]], returns.r[index[order]]
-        terms = np.stack([np.ones(len(r)), x, y, z, z * z, r, r * r, r * z])
+        z, r = returns.z[index[order]], returns.r[index[order]]
+        terms = np.stack([np.ones(len(r)), z, z * z, r, r * r, r * z])
         return cls(key[order], np.pad(np.cumsum(terms, axis=1), ((0, 0), (1, 0))))
 
     def roughness(self) -> float:
         """Median of the standard deviations in windows all around the sensor [m]."""
         begin, sector = np.meshgrid(WINDOWS, np.arange(0, SECTORS, 2 * WIDTH + 1))
-        std = self.window(sector.ravel(), begin.ravel(), BEHIND * begin.ravel())[2]
+        std = self.window(sector.ravel(), begin.ravel(), BEHIND * begin.ravel())[-1]
         return float(np.median(std[std > 0.0])) if std.any() else 0.0
 
     def window(
         self, sector: IntArray, begin: FloatArray, end: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Ground at ranges from `begin` to `end` [m] in and beside each sector, (S,) each.
 
-        Mean place, (3, S) [m]; slope dz/dr of the line through it, and standard deviation about
+        Mean range and height [m]; slope dz/dr of the line through it, and standard deviation about
         that line [m]; all 0 where nothing is seen.
         """
         total = np.zeros((len(self.sums), len(sector)))
@@ -301,11 +369,11 @@ class _Ground(NamedTuple):
             start = (sector + aside) % SECTORS * FARTHEST
             first, stop = (np.searchsorted(self.key, start + r) for r in (begin, end))
             total += self.sums[:, np.maximum(first, stop)] - self.sums[:, first]
-        x, y, z, zz, r, rr, rz = total[1:] / np.maximum(total[0], 1.0)
+        z, zz, r, rr, rz = total[1:] / np.maximum(total[0], 1.0)
         spread, both = np.maximum(rr - r * r, 0.0), rz - r * z
         slope = np.where(spread > 0.01, both / np.maximum(spread, 0.01), 0.0)
         std = np.sqrt(np.maximum(zz - z * z - slope * both, 0.0))
-        return np.stack([x, y, z]), slope, std
+        return r, z, slope, std
 
 
 def _group(sector: IntArray, near: FloatArray, far: FloatArray) -> tuple[IntArray, IntArray]:
@@ -324,37 +392,13 @@ def _group(sector: IntArray, near: FloatArray, far: FloatArray) -> tuple[IntArra
     return np.where(joined, gap, 0), group
 
 
-def _is_edge(returns: _Returns, steps: _Steps, max_step_down: float) -> bool:
+def _is_edge(steps: _Steps, near: FloatArray, max_step_down: float) -> bool:
     """Whether neighbouring steps are an edge that is wide enough, and no descent."""
-    n, upper, lower = len(steps.upper), steps.upper, steps.lower
-    width = 2.0 * math.pi / SECTORS * returns.r[upper].sum()
-    n_strong = np.count_nonzero(steps.fall > max_step_down)
-    if n < MIN_STEPS or width < MIN_WIDTH or n_strong < max(MIN_STEPS, MIN_STRONG * n):
-        return False
-    if np.count_nonzero(steps.is_on_slope) > MAX_ON_SLOPE * n:
-        return False
-    behind = [lower]
-    for share in NEXT_RINGS[1:]:
-        following, known = _next_ring(returns, lower, share)
-        behind.append(following[known])
-    here, there = returns.xyz[:, upper], returns.xyz[:, lower]
-    level = np.minimum(here[2], steps.before[2])
-    lowest, unsure = _plane_at(returns.xyz[:, np.concatenate(behind)], here)
-    from_behind = np.median(level - lowest - N_STD * unsure)
-    carried_on, unsure = _plane_at(np.concatenate([here, steps.before], axis=1), there)
-    from_before = np.median(np.minimum(carried_on, level) - N_STD * unsure - there[2])
-    return bool(min(from_behind, from_before) > WEAK * max_step_down)
-
-
-def _plane_at(points: FloatArray, places: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Height of the plane through `points` (3, P) at `places` (3, S), and its deviation, (S,) [m].
-
-    The slope has a prior: it is level, to within `SLOPE_STD`. So few points, or points along a
-    line, tell of the slope across as little as they show.
-    """
-    middle = points.mean(axis=1)
-    x_y, z = points[:2] - middle[:2, None], points[2] - middle[2]
-    covariance = np.linalg.inv(x_y @ x_y.T + (PLANE_STD / SLOPE_STD) ** 2 * np.eye(2))
-    away = places[:2] - middle[:2, None]
-    height = middle[2] + (covariance @ (x_y @ z)) @ away
-    return height, PLANE_STD * np.sqrt(np.einsum('is,ij,js->s', away, covariance, away))
+    n, is_strong = len(near), steps.fall > max_step_down
+    n_certain = np.count_nonzero(is_strong & steps.is_steep & ~steps.is_on_slope)
+    return bool(
+        2.0 * math.pi / SECTORS * near.sum() >= MIN_WIDTH
+        and n_certain >= MIN_STEPS
+        and np.count_nonzero(is_strong) >= MIN_STRONG * n
+        and np.count_nonzero(steps.is_on_slope) <= MAX_ON_SLOPE * n
+    )

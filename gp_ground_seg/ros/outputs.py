@@ -131,8 +131,8 @@ def read_ground_model(cloud: PointCloud2) -> GroundModel:
 def scan(segmented: SegmentedCloud) -> LaserScan:
     """Return the nearest obstacle in each direction about the origin of the cloud.
 
-    Edges of drops are obstacles if ``output.max_step_down`` is not 0. Infinite where the direction
-    has returns and no obstacle, NaN where it has no return.
+    Infinite where the direction has returns and no obstacle, NaN where it has no return. Edges of
+    drops are obstacles if ``output.max_step_down`` is not 0, and NaN is what they may hide.
     """
     step = 2.0 * math.pi / DIRECTIONS
     message = LaserScan(header=segmented.cloud.header, angle_increment=step)

@@ -13,7 +13,7 @@ from gp_ground_seg.data import costmap, step_edges
 from gp_ground_seg.data.costmap import DIRECTIONS, OCCUPIED, SegmentedCloud
 from gp_ground_seg.data.step_edges import SECTORS, find_edges
 from gp_ground_seg.lab.simulation import SENSORS
-from gp_ground_seg.lab.simulation.objects import car
+from gp_ground_seg.lab.simulation.objects import car, wall
 from gp_ground_seg.lab.simulation.scenes import Scene
 from gp_ground_seg.lab.simulation.terrain import Sum, polyline, ramp, rough
 
@@ -59,11 +59,17 @@ def inputs_of(cloud):
     """Arguments of `find_edges` for a cloud in the level frame of its sensor."""
     found = cloud.segmentation
     stands = (found.label == Label.OBSTACLE) & ~(found.labelled.height < 0.0)
-    return cloud.points.astype(np.float64), found.label == Label.GROUND, stands
+    masks = found.label == Label.GROUND, stands
+    return cloud.points.astype(np.float64), *masks, found.pose.sensor_height
+
+
+def found(cloud, max_step_down=MAX_STEP_DOWN):
+    *inputs, height = inputs_of(cloud)
+    return find_edges(*inputs, max_step_down, height)
 
 
 def edges_of(scene, sensor, max_step_down=MAX_STEP_DOWN):
-    return find_edges(*inputs_of(segmented(scene, sensor)), max_step_down).r
+    return found(segmented(scene, sensor), max_step_down).r
 
 
 TOWARDS, AWAY, ASIDE = 0.0, math.pi, -1.0  # headings, also about the seam of the sectors
@@ -75,9 +81,9 @@ def ridge(at, depth, width, heading=0.0):
     return polyline(heading, corners)
 
 
-def trench(width):
-    far = 8.0 + width
-    return polyline(0.0, [(8.0, 0.0), (8.0, -1.2), (far, -1.2), (far, 0.0)])
+def trench(at, width):
+    far = at + width
+    return polyline(0.0, [(at, 0.0), (at, -1.2), (far, -1.2), (far, 0.0)])
 
 
 def uneven(seed, std, scales):
@@ -86,16 +92,16 @@ def uneven(seed, std, scales):
 
 # Terrain, its edge along a heading, sensors, the largest step that is none.
 DROPS = [
-    (drop(4.5, 1.2, 0.4), 4.5, 0.4, MOUNTED, 0.2),
-    (drop(6.0, 0.6, AWAY), 6.0, AWAY, MOUNTED, 0.2),
-    (drop(9.0, 0.3, ASIDE), 9.0, ASIDE, MOUNTED, 0.2),
-    (drop(5.0, 0.15), 5.0, TOWARDS, ['hdl-64e', 'os1-64'], 0.1),
-    (drop(5.0, 0.6), 5.0, TOWARDS, ['hdl-64e', 'os1-64'], 0.5),
-    # From 0.8 m, 0.3 m of the far wall are seen; of a trench 1.5 m wide 0.15 m.
-    (trench(3.0), 8.0, TOWARDS, ['os1-64'], 0.2),
+    (drop(6.0, 1.2, 0.4), 6.0, 0.4, ['hdl-64e', 'os1-128'], 0.2),
+    (drop(3.15, 0.6, AWAY), 3.15, AWAY, ['vlp-16'], 0.2),
+    (drop(7.0, 0.3, ASIDE), 7.0, ASIDE, ['hdl-64e', 'os1-128'], 0.2),
+    (drop(1.6, 0.6, 0.4), 1.6, 0.4, ['os1-128 low'], 0.2),
+    (drop(5.0, 0.15), 5.0, TOWARDS, ['hdl-64e'], 0.1),
+    (drop(2.5, 0.6), 2.5, TOWARDS, ['os1-64'], 0.5),
+    (trench(5.0, 3.0), 5.0, TOWARDS, ['hdl-64e', 'os1-128'], 0.2),
     (Sum((drop(6.0, 0.6), uneven(3, 0.03, (0.6, 6.0)))), 6.0, TOWARDS, ['hdl-64e'], 0.2),
     # The limit: a ramp that is steeper than the line of sight over its edge.
-    (descent(8.0, 15.0, 1.0), 8.0, TOWARDS, ['hdl-64e'], 0.2),
+    (descent(6.0, 20.0, 1.0), 6.0, TOWARDS, ['hdl-64e'], 0.2),
 ]
 
 
@@ -107,10 +113,11 @@ def test_drops_are_marked_at_the_last_ring_before_them(terrain, at, heading, nam
     sensor = MOUNTED[name]
     ahead = np.cos(MIDDLE - heading)
     r, distance = edges_of(terrain, sensor, max_step_down), at / np.maximum(ahead, 0.05)
-    # Directions in which the edge is within 10 m, and ground before it is seen at all.
+    # Where ground is seen before the edge, and over it more steeply than along a ramp.
     down = np.sort([-elevation for elevation in sensor.elevations if elevation < -1e-3])[::-1]
     rings = sensor.height / np.tan(down)
-    towards = (distance <= 10.0) & (distance > 1.05 * rings[0])
+    over = np.append(np.tan(down), 0.0)[np.searchsorted(rings, 1.02 * distance)]
+    towards = (over > step_edges.STEEPEST) & (distance > 1.05 * rings[0])
     assert towards.sum() > 40
     last = np.append(0.0, rings)[np.searchsorted(rings, 0.9 * distance)]
     is_marked = (r <= 1.02 * distance + 0.1) & (r >= 0.85 * last)
@@ -123,7 +130,7 @@ def test_drops_are_marked_at_the_last_ring_before_them(terrain, at, heading, nam
     ('name', 'at', 'depth', 'width'),
     [
         ('hdl-64e', 5.0, 3.0, 90.0),  # a cliff
-        ('vlp-16', 5.0, 3.0, 90.0),
+        ('vlp-16', 3.2, 1.2, 90.0),
         ('os1-128', 4.5, 2.0, 9.0),  # a dike
         ('os1-64', 3.0, 1.2, 90.0),  # a dock
     ],
@@ -139,7 +146,7 @@ def test_ground_goes_on_up_to_an_edge_and_below_it(name, at, depth, width):
     assert below.sum() > 500
     assert cloud.is_ground[below].mean() > 0.97
     assert cloud.is_ground[seen & (along < at) & (along > at - 1.0)].mean() > 0.97
-    r, distance = find_edges(*inputs_of(cloud), MAX_STEP_DOWN).r, at / np.cos(MIDDLE - 0.3)
+    r, distance = found(cloud).r, at / np.cos(MIDDLE - 0.3)
     towards = (distance > 0.0) & (distance <= 10.0)
     assert (r[towards] <= distance[towards] + 0.2).mean() >= 0.95
 
@@ -166,7 +173,7 @@ NO_EDGES = {
         Scene('', LOWER, (*car(LOWER, 7.0, 0.0, math.pi / 2), *car(LOWER, 7.0, -6.0)))
     ]),
     'a step that is allowed': (0.5, [drop(5.0, 0.45)]),
-    'a narrow trench': (0.2, [trench(1.5)]),
+    'a narrow trench': (0.2, [trench(8.0, 1.5)]),
 }  # fmt: skip
 OTHERS = [name for name in MOUNTED if name != 'hdl-64e']
 
@@ -186,14 +193,14 @@ def test_what_is_no_edge(kind, name):
     max_step_down, scenes = NO_EDGES[kind]
     for scene in scenes:
         xyz = segmented(scene, MOUNTED[name], seed=1)
-        assert np.isinf(find_edges(*inputs_of(xyz), max_step_down).r).all(), scene
+        assert np.isinf(found(xyz, max_step_down).r).all(), scene
 
 
 def level_scan(lower=()):
-    """Level ground 1.73 m below in 12 rings; in the sectors `lower` 0.5 m lower from 8 m on."""
+    """Level ground 1.73 m below in 12 rings; in the sectors `lower` 0.5 m lower from 7.5 m on."""
     sector, rings = np.arange(SECTORS), np.geomspace(4.0, 16.0, 24)
     r, azimuth = np.meshgrid(rings, MIDDLE)
-    is_low = np.isin(sector, lower)[:, None] & (r > 8.0)
+    is_low = np.isin(sector, lower)[:, None] & (r > 7.5)
     scale = np.where(is_low, (1.73 + 0.5) / 1.73, 1.0)
     r, z = r * scale, -1.73 * scale
     xyz = np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], axis=-1).reshape(-1, 3)
@@ -206,7 +213,7 @@ def level_scan(lower=()):
         ([], []),
         ([7], []),
         ([7, 9], []),
-        (range(100, 104), []),  # 0.56 m wide
+        (range(100, 104), []),  # 0.51 m wide
         (range(100, 110), range(100, 110)),
         ([100, 101, 102, 105, 106, 107, 108, 109], range(100, 110)),
         ([*range(355, 360), *range(5)], [*range(355, 360), *range(5)]),
@@ -214,7 +221,7 @@ def level_scan(lower=()):
     ],
 )
 def test_neighbours_must_agree(lower, expected):
-    edges = find_edges(*level_scan(list(lower)), MAX_STEP_DOWN)
+    edges = find_edges(*level_scan(list(lower)), MAX_STEP_DOWN, 1.73)
     assert set(np.flatnonzero(np.isfinite(edges.r))) == set(expected)
     np.testing.assert_array_equal(np.isfinite(edges.z), np.isfinite(edges.r))
     points = edges.points()
@@ -222,36 +229,36 @@ def test_neighbours_must_agree(lower, expected):
     if len(expected):
         r = np.hypot(points[:, 0], points[:, 1])
         last = np.geomspace(4.0, 16.0, 24)
-        np.testing.assert_allclose(r, last[last <= 8.0].max())
+        np.testing.assert_allclose(r, last[last <= 7.5].max())
         np.testing.assert_allclose(points[:, 2], -1.73)
         turn = np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi) + 0.5
         assert set((turn * SECTORS).astype(int)) == set(expected)
 
 
-@pytest.mark.parametrize(('r', 'slope', 'is_hidden'), [(9.0, 0.212, True), (13.0, 0.17, False)])
+@pytest.mark.parametrize(('r', 'slope', 'is_hidden'), [(8.8, 0.2245, True), (12.0, 0.19, False)])
 def test_what_stands_in_the_line_of_sight_hides_the_lower_ground(r, slope, is_hidden):
     """Between the last ring before the edge and the first behind it, or behind both."""
     xyz, is_ground, stands = level_scan(lower := range(100, 110))
     objects = [[r * np.cos(a), r * np.sin(a), -slope * r] for a in MIDDLE[lower]]
     masks = np.append(is_ground, np.zeros(10, bool)), np.append(stands, np.ones(10, bool))
-    edges = find_edges(np.concatenate([xyz, objects]), *masks, MAX_STEP_DOWN)
+    edges = find_edges(np.concatenate([xyz, objects]), *masks, MAX_STEP_DOWN, 1.73)
     assert (np.isinf(edges.r[lower]) == is_hidden).all()
 
 
 def test_order_and_strange_points_do_not_matter():
     xyz, *masks = level_scan(range(50, 70))
-    expected = find_edges(xyz, *masks, MAX_STEP_DOWN).r
+    expected = find_edges(xyz, *masks, MAX_STEP_DOWN, 1.73).r
     order = np.random.default_rng(0).permutation(len(xyz))
     np.testing.assert_array_equal(
-        find_edges(xyz[order], *(mask[order] for mask in masks), MAX_STEP_DOWN).r, expected
+        find_edges(xyz[order], *(mask[order] for mask in masks), MAX_STEP_DOWN, 1.73).r, expected
     )
     strange = np.array([[np.nan] * 3, [np.inf, 0, -1], [1, 1, -np.inf], [0, 0, 0], [1e38] * 3])
     for value in (False, True):
         more = (np.append(mask, np.full(5, value)) for mask in masks)
-        found = find_edges(np.concatenate([xyz, strange]), *more, MAX_STEP_DOWN).r
+        found = find_edges(np.concatenate([xyz, strange]), *more, MAX_STEP_DOWN, 1.73).r
         np.testing.assert_array_equal(found, expected)
     for n in (0, 1, 2, 3):
-        assert np.isinf(find_edges(xyz[:n], *(m[:n] for m in masks), MAX_STEP_DOWN).r).all()
+        assert np.isinf(find_edges(xyz[:n], *(m[:n] for m in masks), MAX_STEP_DOWN, 1.73).r).all()
 
 
 def test_scan_ends_at_the_edge_and_occupancy_has_it():
@@ -271,6 +278,62 @@ def test_scan_ends_at_the_edge_and_occupancy_has_it():
     column = 100 + rows[:, 100:].argmax(axis=1)
     assert rows.any(axis=1).all()
     assert (column >= 100 + 52).all() and (column <= 100 + 60).all()
+
+
+MIDDLE_OF_DIRECTIONS = (np.arange(DIRECTIONS) + 0.5) * 2.0 * np.pi / DIRECTIONS - np.pi
+AHEAD = abs(MIDDLE_OF_DIRECTIONS) < 0.5
+LOW = ['os1-64', 'os1-128 low']
+
+
+def ranges_and_cells(scene, name, **values):
+    """``~/scan``, and cells of ``~/occupancy`` 1 m wide ahead, by tenths of metres."""
+    heights = {'output.min_height': 0.15, 'sensor.height': MOUNTED[name].height}
+    cloud = segmented(scene, MOUNTED[name], **heights, **values)
+    ranges = costmap.scan_ranges(cloud.blocked, cloud.places(np.ones(len(cloud.points), bool)))
+    reach, ground = np.full(DIRECTIONS, 100.0, np.float32), cloud.places(cloud.is_ground)
+    cells = costmap.occupancy(ground, cloud.blocked, reach, 0.1, 40.0)
+    return ranges, cells[195:205, 200:]
+
+
+@pytest.mark.parametrize('name', LOW)
+@pytest.mark.parametrize('depth', [0.25, 0.6, 1.2])
+def test_a_drop_before_the_first_ring_is_not_free(name, depth):
+    """NaN, whatever is behind, and unknown; on the other side all is free as before."""
+    ground = drop(0.8, depth)
+    scene = Scene('', ground, (*wall(ground, (9.0, -9.0), (9.0, 9.0), 3.0),))
+    ranges, cells = ranges_and_cells(scene, name)
+    assert np.isnan(ranges[AHEAD]).all()
+    assert (cells[:, 10:80] == costmap.UNKNOWN).all()
+    assert np.isposinf(ranges[np.cos(MIDDLE_OF_DIRECTIONS) < -0.5]).all()
+    ranges, cells = ranges_and_cells(scene, name, **{'output.max_step_down': 2.0})
+    assert np.isfinite(ranges[AHEAD]).mean() > 0.95
+    assert depth > 0.5 or (cells[:, 40:60] == costmap.FREE).mean() > 0.9
+
+
+@pytest.mark.parametrize('name', LOW)
+@pytest.mark.parametrize('degrees', [3.0, 6.0, 10.0])
+@pytest.mark.parametrize('at', [0.6, 2.0])
+def test_a_ramp_that_is_seen_is_free(name, degrees, at):
+    ranges, cells = ranges_and_cells(descent(at, degrees, 1.0), name)
+    assert np.isposinf(ranges[AHEAD]).mean() > 0.99
+    assert (cells[:, 30:50] == costmap.FREE).mean() > 0.9
+
+
+def test_a_hidden_slope_is_neither_marked_nor_free():
+    """The same returns, of a ramp that robots drive, and of a dock."""
+    for ground in (descent(3.5, 11.0, 1.2), drop(3.5, 1.2)):
+        ranges, cells = ranges_and_cells(ground, 'os1-128 low')
+        assert np.isnan(ranges[AHEAD]).all()
+        assert (cells[:, 15:30] == costmap.FREE).mean() > 0.9
+        assert (cells[:, 40:] == costmap.UNKNOWN).all()
+
+
+def test_own_level_behind_a_ditch_is_free():
+    ranges, cells = ranges_and_cells(trench(2.5, 1.5), 'os1-64')
+    assert (cells[:, 22:27] == OCCUPIED).any(axis=1).all()
+    assert not (cells[:, 27:39] == costmap.FREE).any()
+    assert (cells[:, 50:80] == costmap.FREE).mean() > 0.2
+    assert np.isfinite(ranges[AHEAD]).all()
 
 
 def test_off_nothing_is_looked_for(monkeypatch):
