@@ -28,6 +28,9 @@ from gp_ground_seg.lab.scoring.objects import (
 )
 
 
+LOW = [*CLASSES].index(LOW_CLASSES[0])
+
+
 def counted_by_loops(points, label, objects):
     """Count as the module says it does, one return after the other."""
     share, own = {}, {}
@@ -35,14 +38,14 @@ def counted_by_loops(points, label, objects):
         kind, number, is_ground = objects.class_of[k], objects.object_id[k], label[k] == 1
         if math.isinf(x) or kind < 0:
             continue
-        if not z - objects.ground_z[k] >= (0.1 if kind >= 3 else MIN_HEIGHT):
+        if not z - objects.ground_z[k] >= (0.1 if kind >= LOW else MIN_HEIGHT):
             continue
         share.setdefault(kind, []).append(is_ground)
         if number:
             own.setdefault((kind, number), []).append(is_ground)
     found = {}
     for (kind, _), its in own.items():
-        if len(its) >= (3 if kind >= 3 else MIN_RETURNS):
+        if len(its) >= (3 if kind >= LOW else MIN_RETURNS):
             found.setdefault(kind, []).append(sum(its) > len(its) / 2)
     return [
         {'class': [*CLASSES][kind], **dict(zip(OBJECT_COUNTS, (
@@ -60,7 +63,7 @@ def drawn_scan(seed, n):
     points[rng.random(n) < 0.02, 0] = math.inf
     label = rng.integers(0, 3, n).astype(np.uint8)
     ground_z = np.where(rng.random(n) < 0.1, np.nan, 0.0)
-    kind, number = rng.choice([-1, 0, 1, 3], n), rng.integers(0, 4, n)
+    kind, number = rng.choice([-1, 0, 1, LOW], n), rng.integers(0, 4, n)
     return points, label, Objects(kind, number, ground_z)
 
 
@@ -132,7 +135,7 @@ def test_objects_of_labels_are_instances_by_group():
     entries = np.array([number | 5 << 16 for number in known] + [10, 30], dtype=np.uint32)
     points, nothing = np.zeros((len(entries), 3)), np.zeros(len(entries), dtype=bool)
     found = labelled_objects(points, entries, nothing)
-    assert [*CLASSES] == ['vehicle', 'person', 'cyclist', *LOW_CLASSES]
+    assert [*CLASSES] == ['vehicle', 'person', 'cyclist', 'vegetation', *LOW_CLASSES]
     assert found.class_of.tolist() == [*known.values(), 0, 1]
     assert found.object_id[-2:].tolist() == [0, 0]
     assert len(set(found.object_id[:-2].tolist())) == len(known)
@@ -223,11 +226,12 @@ def test_tables_of_objects_low_things_and_false_cells_are_those_of_the_labels(tm
         return json.loads(target.read_text())
 
     document = evaluated('--peer', 'patchworkpp', '--cut', 1)
-    assert re.search(r'^vehicle +\d.* 2 +0 +\d', capsys.readouterr().out, re.MULTILINE)
+    assert re.search(r'^ *vehicle +\d.* 2 +0 +\d', capsys.readouterr().out, re.MULTILINE)
     is_ground, segment = entries == 40, GroundSegmenter().segment
     result = segment(points)
     rows = count_objects(points, result.label, labelled_objects(points, entries, is_ground))
-    (row,), (own,) = document['objects'], rows
+    row, own = document['objects'][0], rows[0]
+    assert [one['class'] for one in rows] == ['vehicle', 'vegetation']
     names = 'class', 'n_returns', 'n_objects', 'n_lost'
     assert [row[name] for name in names] == [own[name] for name in names]
     assert row['share_ground'] == own['n_ground'] / own['n_returns']

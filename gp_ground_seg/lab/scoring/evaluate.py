@@ -149,7 +149,7 @@ def labelled_scan(
     truth = metrics.true_labels(semantic)
     is_ground = truth == Label.GROUND
     found = objects.labelled_objects(points, entries, is_ground)
-    low = objects.cut_objects(points, found.class_of >= 0, is_ground, cut) if cut else None
+    low = objects.cut_objects(points, found.can_be_cut, is_ground, cut) if cut else None
     return KnownScan(sequence, index, points, truth, semantic, z, is_ground, found, cut=low)
 
 
@@ -249,7 +249,8 @@ def score_scan(scan: KnownScan, result: MethodResult | Segmentation) -> Rows:
         )
     if scan.objects is not None:
         rows['objects'] = objects.count_objects(scan.points, label, scan.objects)
-        sums |= {name: sum(row[name] for row in rows['objects']) for name in OBJECT_COUNTS}
+        things = [row for row in rows['objects'] if row['class'] != objects.PLANTS]
+        sums |= {name: sum(row[name] for row in things) for name in OBJECT_COUNTS}
     if isinstance(result, Segmentation):
         if scan.semantic is not None:
             sums |= objects.count_false_cells(scan.points, label, result.height, scan.semantic)

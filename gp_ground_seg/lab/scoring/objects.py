@@ -17,6 +17,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
+from gp_ground_seg.data.semantic_kitti import VEGETATION
 from gp_ground_seg.lab.scoring.metrics import Labels
 
 MIN_HEIGHT = 0.3
@@ -31,10 +32,13 @@ MAX_GROUND_DISTANCE = 5.0  # to the farthest of them [m]
 LOW_HEIGHTS = (0.2, 0.3, 0.4, 0.5, 0.6)
 """Heights of low objects [m], each a class of its own, which only simulated scans have."""
 LOW_CLASSES = tuple(f'low, {height:g} m' for height in LOW_HEIGHTS)
+PLANTS = 'vegetation'
+"""Class of what is no object of its own: it is neither cut nor lost."""
 CLASSES: dict[str, tuple[int, ...]] = {
     'vehicle': (10, 13, 16, 18, 20, 252, 256, 257, 258, 259),
     'person': (30, 254),
     'cyclist': (11, 15, 31, 32, 253, 255),
+    PLANTS: (VEGETATION,),
     **dict.fromkeys(LOW_CLASSES, ()),
 }
 """Classes of objects, by numbers of SemanticKITTI; two-wheelers with or without a rider."""
@@ -65,6 +69,11 @@ class Objects(NamedTuple):
     class_of: npt.NDArray[np.integer]  # (N,) index into `CLASSES`; negative: on no object
     object_id: npt.NDArray[np.integer]  # (N,) number of it within its class; 0 = not known
     ground_z: npt.NDArray[np.floating]  # (N,) local ground [m]; NaN = not known: does not count
+
+    @property
+    def can_be_cut(self) -> BoolArray:
+        """Which returns lie on objects that are no plants, (N,)."""
+        return (self.class_of >= 0) & (self.class_of != list(CLASSES).index(PLANTS))
 
 
 OBJECT_COUNTS = ('n_returns', 'n_ground', 'n_objects', 'n_lost')
