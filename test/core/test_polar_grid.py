@@ -12,7 +12,7 @@ from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.frame import OUTSIDE
 from gp_ground_seg.core.parameters.config import NARROWEST_BIN
-from gp_ground_seg.core.pipeline.polar_grid import LARGEST_TABLE, grid_geometry
+from gp_ground_seg.core.pipeline.polar_grid import LARGEST_TABLE, bin_edges, grid_geometry
 
 PLACE = st.floats(-120, 120)
 
@@ -96,6 +96,16 @@ def test_cells_tiles_and_candidates_are_the_reference(backend, seed, n, dtype):
         own = candidates.bin[candidates.segment == m]
         assert (np.diff(own) > 0).all()
         assert n_edges == (own[-1] + 2 if len(own) else 0)
+
+
+def test_bins_of_a_low_sensor_are_nearer_and_leave_the_others_where_they_are():
+    """At most twice as many, however narrow they are."""
+    usual, near = (bin_edges(Config().replace(**{'grid.r_min': r}).grid) for r in (2.0, 0.6))
+    np.testing.assert_array_equal(near[-len(usual) :], usual)
+    widths = np.diff(near[: len(near) - len(usual) + 1])
+    assert near[0] == 0.6 and 0.8 < (widths / (usual[1] - usual[0])).min() <= widths.max() < 0.17
+    narrow = {'grid.n_bins': 1024, 'grid.r_min': 0.0, 'grid.bin_growth': 1.6}
+    assert len(bin_edges(Config().replace(**narrow).grid)) <= 2049
 
 
 def test_the_narrowest_bins_that_are_accepted_do_not_fill_the_memory():

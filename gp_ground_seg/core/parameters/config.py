@@ -102,13 +102,29 @@ class GridConfig(ParameterGroup):
     """Radial grid map."""
 
     n_segments: int = basic(180, (4, 2048), 'angular segments of the radial grid', symbol='M')
-    n_bins: int = advanced(80, (4, 1024), 'radial bins of each segment', symbol='N')
+    n_bins: int = advanced(80, (4, 1024),
+        'radial bins of each segment; if r_min is below 2 m, from there on', symbol='N')
     r_min: float = advanced(2.0, (0.0, 50.0),
         'horizontal range where the first bin starts; nearer points belong to that bin', 'm')
     r_max: float = basic(120.0, (1.0, 500.0),
         'horizontal range where the last bin ends; beyond it there is no model', 'm')
     bin_growth: float = advanced(1.5, (1.0, 3.0),
         'exponent of the bin edges over range: 1 = equal bins, more = finer bins near the sensor')
+
+    @property
+    def start(self) -> float:
+        """Range from which bins grow [m]; nearer ones are as wide as the first beyond it."""
+        return max(self.r_min, min(2.0, 0.5 * self.r_max))
+
+    @property
+    def first_width(self) -> float:
+        """Width of the first bin from `start` on, the narrowest of those beyond [m]."""
+        return float(self.r_max - self.start) / float(self.n_bins) ** self.bin_growth
+
+    @property
+    def n_near(self) -> int:
+        """Bins nearer than `start`, at most as many as beyond."""
+        return min(math.ceil((self.start - self.r_min) / self.first_width), self.n_bins)
 
 
 @dataclass(frozen=True)
@@ -325,7 +341,7 @@ class Config(ParameterGroups):
                 raise ConfigError(f'{lower} = {low:g}: must be below {upper} = {high:g}')
         grid, size = self.grid, size_of_tables(self)
         # Bins widen with range: the first one is the narrowest.
-        width = (grid.r_max - grid.r_min) / float(grid.n_bins) ** grid.bin_growth
+        width = grid.first_width
         if width < NARROWEST_BIN:
             raise ConfigError(
                 f'grid.n_bins = {grid.n_bins}, grid.bin_growth = {grid.bin_growth:g} between '
@@ -348,7 +364,7 @@ class Config(ParameterGroups):
 def size_of_tables(config: Config) -> int:
     """Memory that tables of tiles and cells take, of points of double precision [bytes]."""
     n_tiles = math.ceil(2.0 * config.grid.r_max / config.faces.cell_size) ** 2
-    n_cells = config.grid.n_segments * config.grid.n_bins
+    n_cells = config.grid.n_segments * (config.grid.n_bins + config.grid.n_near)
     # Held against both backends by test_robustness.py.
     return 9 * n_tiles + 184 * n_cells
 

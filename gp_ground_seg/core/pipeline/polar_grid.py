@@ -26,8 +26,6 @@ from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, GridConfig
 from gp_ground_seg.core.pipeline.points import finite_points, in_columns
 
-FIRST = 2.0
-"""Range from which bins grow [m]."""
 LARGEST_TABLE = 2**20
 EARLY = 0.1
 """Offset of the entries of a table towards smaller values, in entries: more than the error of
@@ -49,16 +47,14 @@ def build_scan(xyz: PointArray, config: Config) -> Scan:
 
 
 def bin_edges(grid: GridConfig) -> FloatArray:
-    """Ranges of the bin edges [m], read-only: of `n_bins` bins from `FIRST` on, and of near ones.
+    """Ranges of the bin edges [m], read-only: `n_bins` bins from `start` on, and nearer ones.
 
-    Those nearer than `FIRST` are about as wide as the first beyond it, so that what is seen near
-    a low sensor does not move the others.
+    So what is seen near a low sensor does not move the bins beyond.
     """
     fraction = np.arange(grid.n_bins + 1) / grid.n_bins
-    first = max(grid.r_min, min(FIRST, 0.5 * grid.r_max))
-    edges: FloatArray = first + (grid.r_max - first) * fraction**grid.bin_growth
-    n_near = math.ceil((first - grid.r_min) / (edges[1] - first))
-    edges = np.concatenate([np.linspace(grid.r_min, first, n_near, endpoint=False), edges])
+    edges: FloatArray = grid.start + (grid.r_max - grid.start) * fraction**grid.bin_growth
+    near = np.linspace(grid.r_min, grid.start, grid.n_near, endpoint=False)
+    edges = np.concatenate([near, edges])
     edges.setflags(write=False)
     return edges
 
