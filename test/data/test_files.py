@@ -138,7 +138,6 @@ def test_sqlite_bag_that_lost_its_last_bytes(whole, tmp_path, n_bytes):
 
 HUGE = (
     ('segment SCAN -o a.label', 'SCAN', f'accepted are at most {1 << 30}'),
-    ('evaluate ROOT', 'LABEL', 'expected 7204 for 1801 points'),
     ('plot scan SCAN --labels LABEL -o a.png', 'LABEL', 'expected 7204 for 1801 points'),
     ('evaluate ROOT', 'TIMES', 'accepted are at most'),
     ('segment SCAN --config YAML -o a.label', 'YAML', 'too large for a parameter file'),

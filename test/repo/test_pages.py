@@ -188,32 +188,5 @@ def test_commands_of_the_tutorial_run_as_they_stand(block, tmp_path):
     assert done.returncode == 0 and 'Traceback' not in done.stdout, done.stdout
 
 
-PAGE = """\
-# A page
-<!-- figure: experiment scenes --sensors vlp-16
-sample: --scenes kerb
--->
-stale
-<!-- end of figure 12345678 -->
-And text.
-"""
-TABLE = """\
-| a | n | x | y |
-| --- | --: | --: | --: |
-| one | 3 | 1.5 | - |
-| two | 0 | - | - |
-| three | 0 | 0.0 | - |"""
-
-
-def test_a_table_without_empty_rows_and_columns_and_those_that_a_figure_keeps():
-    three = '| one | 3 | 1.5 |\n| three | 0 | 0.0 |'
-    assert figures.trimmed(TABLE) == f'| a | n | x |\n| --- | --: | --: |\n{three}'
-    assert figures.trimmed(TABLE, ['n'], 'one|two') == '| a | x |\n| --- | --: |\n| one | 1.5 |'
-    (figure,) = figures.find_figures('a.md', PAGE.replace('sample:', 'keep: B; C\nsample:'))
-    a, b, c = (f'| {name} |\n| --- |\n| 1 |' for name in 'abc')
-    parts = ['A is', a, 'a note', 'B is', b, 'C', c, 'machine: x', 'result']
-    assert figures.kept(figure, '\n\n'.join(parts)) == '\n\n'.join(parts[3:-1])
-
-
 def test_each_table_has_its_sample_and_no_other_is_kept():
     assert set(figures.read_samples()) == {figure.sample for figure in SAMPLED}
