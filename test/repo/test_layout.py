@@ -61,7 +61,7 @@ def find_returned_arrays(trees):
             is_entry = any('entry=True' in mark for mark in marks)
             if is_entry or ('shared' in marks and node.name in entries):
                 names = {n.id for n in ast.walk(node.returns) if isinstance(n, ast.Name)}
-                if names - {'bool', 'int', 'float', 'tuple'}:
+                if names - {'bool', 'int', 'float', 'tuple', 'Plane'}:
                     yield f'{path}: {node.name} returns {ast.unparse(node.returns)}'
 
 
