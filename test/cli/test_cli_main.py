@@ -94,6 +94,7 @@ MISTAKES = {
     'plot segment scan.npy -o B.png --segment -1': 'segment -1',
     'evaluate many': 'many: no sequences/.*velodyne folder .*; scans without labels need --agai',
     'experiment scenes --scenes flt': "--scenes: 'flt': must be some of .*, each once",
+    'play nowhere.mcap': 'nowhere.mcap: no such file or folder',
     'play scan.npy': r'scan.npy: not a bag; accepted are ROS 1 \.bag, \.mcap, \.db3 and rosbag2',
     'play A --rate 0': "--rate: '0': must be a number, above 0",
     'play A --rate nan': "--rate: 'nan': must be a number, above 0",
