@@ -65,8 +65,10 @@ chromium:
 browser-test: $(VENV)/.dev chromium
 	$(BIN)/python -m pytest test/lab/test_browser.py
 
+torture: export TORTURE_SCALE ?= 1
 torture: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto --timeout=900 --timeout-method=thread test/torture.py
+	$(BIN)/python -m pytest -n auto --timeout=900 --timeout-method=thread \
+		test/torture.py test/data/test_files.py -k 'torture or damage'
 
 bench: $(VENV)/.dev
 	$(BIN)/gp-ground-seg experiment speed $(KITTI)

@@ -3,6 +3,8 @@
 import importlib.util
 import os
 import signal
+import subprocess
+import sys
 from functools import cache, lru_cache
 from pathlib import Path
 
@@ -49,6 +51,17 @@ def load_script(path):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def run_python(script, *words, **environment):
+    """Output and errors of a script, run by this Python in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, '-c', script, *map(str, words)], check=False, timeout=120,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path), **environment},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout, done.stderr
 
 
 def find_kitti() -> Path | None:

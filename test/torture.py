@@ -1,31 +1,22 @@
-"""Hostile clouds, files and messages: `make torture`, TORTURE_SCALE=100 for a night.
+"""Hostile clouds and messages: `make torture`, TORTURE_SCALE=100 for a night.
 
 Each case follows from its number. A test runs a hundred or so of them; a crash or a hang of the
 process is a failure too. With TORTURE_STEP=1 each is a test of its own, which -k can choose.
 """
 
 import os
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_samples import scan, write_ros1_bag, write_ros2_bag
-from foreign_files import CASES
 from rclpy.serialization import serialize_message
 from ros_helpers import linked_process, street, to_message
 from rosgraph_msgs.msg import Clock
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
-from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import parameter_specs
 from gp_ground_seg.core.pipeline.points import take_points
-from gp_ground_seg.data.cloud_files import WRITABLE, decode_file, encode_file
-from gp_ground_seg.data.clouds import Cloud
-from gp_ground_seg.data.inputs import list_inputs
 
-SLOWEST = 30
-"""Time that the reading of a file may take [s]."""
 MAX_DIFFERENT = 0.02
 """Share of the points that rounding may decide differently in the two backends: one candidate
 that joins or not changes the labels of its cells."""
@@ -168,97 +159,6 @@ def try_cloud(number):
     )
 
 
-WORDS = [
-    b'FIELDS x y z\n', b'SIZE 8 8 8\n', b'TYPE U U U\n', b'COUNT 3 1 1\n', b'COUNT 0 1 1\n',
-    b'WIDTH 0\n', b'HEIGHT 2\n', b'POINTS 4294967296\n', b'DATA binary\n', b'DATA ascii\n',
-    b'DATA binary_compressed\n', b'property list uchar int a\n', b'property double x\n',
-    b'element vertex 0\n', b'format ascii 1.0\n', b'nan', b'-inf', b'1e999', b'1_0',
-    b"'descr': [('x', '<f4', (2,))]", b"('x', 'O')", b"'shape': (99999999999,)", b'-1', b' ',
-    b'*a', b'&a [*a, *a]', b'.nan', b'0x7f', b'!!python/name:os', b'~', b'[1, 2]', b'{a: b}',
-    b'?\n', b'"\\ud800"', b'\ngrid:\n', b'1' * 300, b'\t', b'0x10', b'\r', b'\0',
-    b'999999999999999999999', b'\xc3\xa9', b'\xff' * 4, b'\0\0\0\x80',
-]  # fmt: skip
-
-
-def mutant(rng, seeds):
-    """Change an input in some places, or put the halves of two together."""
-    data = bytearray(seeds[rng.integers(len(seeds))])
-    for _ in range(rng.integers(1, 5)):
-        at, size = int(rng.integers(len(data) + 1)), int(rng.choice([1, 4, 30, 500]))
-        other = seeds[rng.integers(len(seeds))]
-        kind = rng.integers(6)
-        if kind == 0:
-            del data[at : at + size]
-        elif kind == 1:
-            data[at:at] = data[at : at + size]
-        elif kind == 2:
-            data[at : at + size] = rng.bytes(len(data[at : at + size]))
-        elif kind == 3:
-            data[at:at] = WORDS[rng.integers(len(WORDS))]
-        elif kind == 4 and data:
-            data[at % len(data)] ^= 1 << rng.integers(8)
-        else:
-            data = data[:at] + other[int(rng.integers(len(other) + 1)) :]
-    return bytes(data)
-
-
-def read_and_write(path):
-    """Read a file of points; written, it must be the same cloud."""
-    cloud = decode_file(path, path.read_bytes())
-    label = np.zeros(len(cloud.xyz), 'u1')
-    again = decode_file(path, encode_file(path, cloud, {'label': label}))
-    assert np.array_equal(again.xyz, cloud.xyz, equal_nan=True), 'written, another cloud'
-
-
-def read_clouds(path):
-    """Read every cloud of a scan or bag."""
-    for one in list_inputs(path):
-        one.read()
-
-
-READERS = {
-    **dict.fromkeys(WRITABLE, read_and_write),
-    **dict.fromkeys(('.bin', '.mcap', '.db3', '.bag', '.drive'), read_clouds),
-    '.yaml': Config.from_yaml,
-}
-N_INPUTS = 200
-"""Damaged files of a case of `readers`."""
-
-
-def seeds_of(suffix, path):
-    """Whole files of a format, of which some are written to `path`."""
-    if suffix in WRITABLE:
-        points = np.zeros(5, [('x', 'f4'), ('y', 'f8'), ('z', '>f4'), ('n', 'u2', 2), ('b', '?')])
-        own = encode_file(path, Cloud(points, np.zeros((5, 3))), {})
-        others = [data for name, (data, _) in CASES.items() if name.endswith(suffix)]
-        return [own, *(data for data in others if isinstance(data, bytes))]
-    if suffix == '.bin':
-        scan().tofile(path)
-    elif suffix == '.yaml':
-        path.write_text(Config().to_yaml())
-    else:
-        (write_ros1_bag if suffix == '.bag' else write_ros2_bag)(path)
-    return [(path / 'metadata.yaml' if path.is_dir() else path).read_bytes()]
-
-
-def try_reader(number, folder):
-    """Read damaged files of one format: each has clouds or parameters, or is refused in a line."""
-    rng, suffix = np.random.default_rng([48, number]), list(READERS)[number % len(READERS)]
-    path = folder / f'{number}{suffix}'
-    seeds = seeds_of(suffix, path)
-    for _ in range(N_INPUTS):
-        said = ''
-        (path / 'metadata.yaml' if path.is_dir() else path).write_bytes(mutant(rng, seeds))
-        signal.alarm(SLOWEST)
-        try:
-            READERS[suffix](path)
-        except (DataError, ConfigError) as error:
-            said = str(error)
-        finally:
-            signal.alarm(0)
-        assert '\n' not in said and len(said) < 800, said
-
-
 MAX_RSS = 1.5e9
 """Memory that the node may hold [bytes]."""
 
@@ -314,11 +214,6 @@ def run_cases(numbers, run_case):
 @cases(1000, 100)
 def test_clouds(numbers):
     run_cases(numbers, try_cloud)
-
-
-@cases(300, 60)
-def test_readers(numbers, tmp_path):
-    run_cases(numbers, lambda number: try_reader(number, tmp_path))
 
 
 @cases(400, 200)

@@ -137,13 +137,6 @@ def test_it_ends_without_a_subscriber_and_with_one_that_is_killed(tmp_path, monk
             assert subscriber.wait(PATIENCE) == -signal.SIGKILL
 
 
-def test_refused(tmp_path, capsys):
-    bag, silent = drive(tmp_path, 1), tmp_path / 'silent.mcap'
-    write_ros2_bag(silent, 0)
-    for words, said in (
-        ([tmp_path / 'none.mcap'], f'{tmp_path / "none.mcap"}: no such file or folder'),
-        ([silent], f'{silent}: no message on /points'),
-        ([bag, '--quiet', '--ros-args', '-r', 'nonsense'], ''),
-    ):
-        assert play(*words) == 2
-        assert error_line(capsys).startswith(said)
+def test_words_that_ros_refuses(tmp_path, capsys):
+    assert play(drive(tmp_path, 1), '--quiet', '--ros-args', '-r', 'nonsense') == 2
+    assert 'nonsense' in error_line(capsys)

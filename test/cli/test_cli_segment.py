@@ -183,64 +183,6 @@ def test_scans_give_label_files(segmenter, tmp_path, capsys, monkeypatch, scans,
     assert hidden(out.parent) == hidden(out) == []
 
 
-@pytest.fixture(scope='module')
-def inputs(tmp_path_factory):
-    """A folder with inputs of every kind, good and bad ones."""
-    folder = tmp_path_factory.mktemp('inputs')
-    write_bag(folder / 'drive.mcap')
-    write_scans(folder / 'good', n_scans=1)
-    for name in ('00', '08'):
-        write_scans(folder / 'root/sequences' / name / 'velodyne', n_scans=1)
-    for name in ('unfinished', 'arrays', 'mine'):
-        (folder / name).mkdir()
-    for name in ('a.npy', 'arrays/a.npy'):
-        np.save(folder / name, samples.scan())
-    for name in ('notes.md', 'taken.pcd', 'mine/000000.label'):
-        (folder / name).write_text('1 2 3\n')
-    (folder / 'unfinished/x_0.mcap').write_bytes(b'')
-    (folder / 'short.bin').write_bytes(b'0123456789')
-    return folder
-
-
-def content(folder):
-    return {path: path.is_file() and path.read_bytes() for path in folder.rglob('*')}
-
-
-@pytest.mark.parametrize(
-    ('words', 'message'),
-    [
-        ('drive.mcap --topic /note', '/note is of type std_msgs/msg/String, must be sensor_msgs'),
-        ('unfinished', 'no metadata.yaml in it); bag files in it'),
-        ('drive.mcap drive.mcap --format ply -o x', '--format: is for scans, or for one bag'),
-        ('drive.mcap -o x.bag', 'only ROS 2 bags are written'),
-        ('drive.mcap -o no/such/x', 'no/such does not exist'),
-        ('drive.mcap -o . --force', 'is the input, or has it in it'),
-        ('drive.mcap --format pcd --columns 5', '--columns: is for .bin scans'),
-        ('drive.mcap ./drive.mcap -o x', 'two of the bags would become drive_ground.mcap'),
-        ('drive.mcap a.npy -o x', 'a.npy: is no bag, of several inputs each must be one'),
-        ('root --format ply', '--format ply: a KITTI_ROOT gives .label files'),
-        ('root -o x.ply', 'x.ply: must be a folder'),
-        ('good -o x.label', 'x.label: must be a folder'),
-        ('good -o notes.md', 'notes.md: must be a folder'),
-        ('good -o mine', 'mine/000000.label: exists already; --force'),
-        ('arrays -o arrays --force', 'is the input'),
-        ('short.bin -o new.label', 'short.bin: 10 bytes is not a whole number'),
-        ('a.npy -o a.npy --force', 'a.npy: is the input'),
-        ('a.npy -o a.xyz', 'a.xyz: must be a folder, or end in .label, .pcd'),
-        ('a.npy -o taken.pcd', 'taken.pcd: exists already'),
-        ('a.npy -o x.pcd --format ply', 'x.pcd: ends in .pcd, which is not ply'),
-        ('a.npy --topic /a', '--topic: is for bags'),
-        ('a.npy --columns 5', '--columns: is for .bin scans, which a.npy is not'),
-    ],
-)
-def test_refused_in_one_line_and_nothing_is_changed(inputs, capsys, monkeypatch, words, message):
-    monkeypatch.chdir(inputs)
-    before = content(inputs)
-    assert segment(*words.split()) == 2
-    assert message in error_line(capsys)
-    assert content(inputs) == before
-
-
 # Height and tilt of the sensor.
 
 SMALL = dataclasses.replace(HDL_64E, n_columns=500)
@@ -271,17 +213,6 @@ def test_the_summary_has_height_and_tilt_of_the_sensor_and_what_they_contradict(
         'measured in 3 frames: sensor.height=1.20 (std 0.10) m, '
         'sensor.roll=0.100 (std 0.058) rad, sensor.pitch=-0.200 (std 0.115) rad'
     )
-
-
-def test_the_advice_to_a_scan_that_is_upside_down_works(tmp_path, capsys):
-    write_scan(tmp_path / 'a.bin', 1.2, turn=(math.pi, 0.0))
-    words = [tmp_path / 'a.bin', '-o', tmp_path / 'a.label', '--quiet']
-    assert segment(*words) == 2
-    said = error_line(capsys)
-    assert said.startswith(f'{tmp_path / "a.bin"}: z does not point up: ')
-    assert not (tmp_path / 'a.label').exists()
-    roll, pitch = (re.search(rf'sensor\.{n} to (\S+)', said)[1] for n in ('roll', 'pitch'))
-    assert segment(*words, '--set', f'sensor.roll={roll}', '--set', f'sensor.pitch={pitch}') == 0
 
 
 def test_a_scan_without_ground_is_named_on_stderr_and_never_a_silent_zero(tmp_path, capsys):
@@ -319,7 +250,3 @@ def test_a_stopped_run_leaves_the_old_bag(tmp_path, capsys, how, code):
     is_old = read_messages(tmp_path / 'out') == before  # pytest would compare them for hours
     assert is_old
     assert len(hidden(tmp_path)) == (how == signal.SIGKILL)
-    # The next run for the same target removes it.
-    samples.write_ros2_bag(tmp_path / 'short', 1)
-    assert segment(tmp_path / 'short', '-o', tmp_path / 'out', '--force') == 0
-    assert hidden(tmp_path) == []

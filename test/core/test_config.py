@@ -220,6 +220,8 @@ VERDICTS = [
         (f'grid.n_bins: {word}', f"grid.n_bins = '{word}': must be an integer")
         for word in ('1_80', '1:20', '0b1000000', '0o100', '2011-02-03', 'x')
     ),
+    ('label:\n\tground_tolerance: 0.1', "'\\t'"),
+    ('sensor: {height: 1.7 m}', "sensor.height = '1.7 m': must be auto or a number"),
     (f'{IN_ROS} {{input.crop_box: [-1, 0.3, -0.4, 0.4, -1, 0.2]}}', 'for ROS: write -1.0'),
     (f'{IN_ROS} {{input.crop_box: [0.0, 3, true]}}', 'input.crop_box = [0.0, 3, True]: must ha'),
     (f'{IN_ROS} {{input.crop_box: [[0.0, 3.0]]}}', '[[0.0, 3.0]]: must have one type for ROS'),

@@ -9,8 +9,8 @@ from config_samples import configs
 from conftest import REPOSITORY, load_script
 from hypothesis import given, settings
 
-from gp_ground_seg import Config, ConfigError
-from gp_ground_seg.core.parameters.config import PRESETS, find_preset, parameter_specs
+from gp_ground_seg import Config
+from gp_ground_seg.core.parameters.config import PRESETS, parameter_specs
 
 GENERATE = 'run: make generate'
 generate = load_script('docs/generate.py')
@@ -45,12 +45,8 @@ def test_generated_files_are_up_to_date():
     assert {f'config/{path.name}' for path in (REPOSITORY / 'config').glob('*.yaml')} <= set(files)
 
 
-def test_the_presets_are_those_promised_and_another_is_refused():
+def test_the_presets_are_those_promised():
     assert list(PRESETS) == ['default', 'paper'] and PRESETS['default'].config == Config()
-    with pytest.raises(
-        ConfigError, match=r"'papr'; did you mean paper\? \(there are default, pap"
-    ):
-        find_preset('papr')
 
 
 def test_the_paper_preset_has_none_of_our_departures():
@@ -127,4 +123,3 @@ def test_file_goes_over_preset_and_setting_over_file(tmp_path, capsys):
     # The reasons of the preset are given for its own values only.
     assert 'Here: one zeta_g for all' in text
     assert 'Here: N in section IV' not in text and 'Preset paper' not in text
-    assert run('config', 'dump', '--set', 'sensor.hight=2.5') == 2

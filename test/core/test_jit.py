@@ -159,7 +159,6 @@ def plant(path):
 
 
 DAMAGES = {
-    'zeros': lambda path: path.write_bytes(path.read_bytes()[:-4096] + bytes(4096)),
     'cut off': lambda path: path.write_bytes(path.read_bytes()[:100]),
     'missing': lambda path: path.unlink(),
 }

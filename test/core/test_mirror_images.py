@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from conftest import simulated
+from rooms import HALL
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
@@ -18,7 +19,9 @@ from gp_ground_seg.core.pipeline.mirror_images import (
     mirror_share,
 )
 from gp_ground_seg.core.pipeline.points import moved
-from gp_ground_seg.lab.simulation import SENSORS
+from gp_ground_seg.lab.simulation import SENSORS, Scene
+from gp_ground_seg.lab.simulation.objects import floating_box
+from gp_ground_seg.lab.simulation.scenes import WetPatch
 
 WET = [('hdl-64e', 0), ('vlp-16', 1)]
 DRY = ['ramp', 'rough', 'ditch', 'dike', 'hills', 'urban', 'car_park', 'low_boxes']
@@ -86,40 +89,19 @@ def test_images_are_told_by_where_rays_start():
     assert not images_in(lifted, Config().sensor)[0].any()
 
 
-def hall(height, steepest, *, is_polished=False, has_tables=False):
-    """Scan by 64 beams in a hall of 16 by 12 m, and which of its returns are of the floor.
-
-    A polished floor mirrors a third of the rays. Tables stand in rows, 0.72 m high, with 0.6 and
-    0.7 m between them.
-    """
-    rng = np.random.default_rng(0)
-    elevation, azimuth = np.meshgrid(
-        np.linspace(-steepest, steepest, 64), np.linspace(-np.pi, np.pi, 1024, endpoint=False)
+def hall(height, steepest, *, share=0.0, tables=()):
+    """Scan by 64 beams in a hall; its floor mirrors a share of the rays."""
+    elevations = tuple(np.linspace(steepest, -steepest, 64).tolist())
+    sensor = dataclasses.replace(
+        SENSORS['hdl-64e'], elevations=elevations, n_columns=1024, height=height, min_range=0.1
     )
-    rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)])
-    rays = np.concatenate([rays, np.sin(elevation)[None]]).reshape(3, -1)
-    sides = np.abs(rays / np.array([[8.0], [6.0], [1.0]]))
-    down, down_to_table = rays[2] < 0.0, np.where(rays[2] < 0.0, (0.72 - height) / rays[2], 99.0)
-    to_wall = 1.0 / np.maximum(sides[0], sides[1])
-    to_floor = np.where(down, -height / rays[2], np.inf)
-    to_ceiling = np.where(down, np.inf, (3.0 - height) / rays[2])
-    t = np.minimum(np.minimum(to_wall, to_floor), to_ceiling)
-    is_floor = t == to_floor
-    if is_polished:
-        mirrored = is_floor & (rng.random(len(t)) < 0.35)
-        # Below the floor the hall stands upside down.
-        t[mirrored] = np.minimum(to_wall, (3.0 + height) / np.abs(rays[2]))[mirrored]
-        is_floor &= ~mirrored
-    if has_tables:
-        x, y = rays[:2] * down_to_table
-        hits = (down_to_table < t) & (x % 2.2 < 1.6) & (y % 1.5 < 0.8)
-        t[hits], is_floor[hits] = down_to_table[hits], False
-    points = rays * (t + rng.normal(0.0, 0.01, len(t)))
-    return points.T.astype(np.float32), is_floor
+    patches = (WetPatch(0.0, 0.0, 40.0, share),)
+    return simulated(Scene('hall', HALL.terrain, (*HALL.solids, *tables), patches), sensor)
 
 
 def test_the_floor_of_a_polished_hall_is_the_ground(backend):
-    points, is_floor = hall(0.45, 0.78, is_polished=True)
+    made = hall(0.45, 0.78, share=0.35)
+    points, is_floor = made.points[:, :3].copy(), made.is_ground.copy()
     wrong = [np.nan, np.inf, -np.inf, 1e38]
     points[::100] = np.resize(wrong, len(points[::100]))[:, None]
     is_floor[::100] = False
@@ -128,14 +110,24 @@ def test_the_floor_of_a_polished_hall_is_the_ground(backend):
     assert (result.is_ground & is_floor).sum() / (result.is_ground | is_floor).sum() > 0.9
 
 
+# In rows, 0.72 m high, with 0.6 and 0.7 m between them.
+TABLES = [
+    floating_box(HALL.terrain, x, y, (1.6, 0.8, 0.04), 0.68)
+    for x in np.arange(-7.0, 11.0, 2.2)
+    for y in np.arange(-4.0, 6.0, 1.5)
+    if abs(x) > 0.9 or abs(y) > 0.5
+]
+
+
 def test_a_polished_floor_is_a_mirror_and_tables_are_not():
     for height, steepest, plane_z, kind in (
-        (0.45, 0.78, -0.45, {'is_polished': True}),
+        (0.45, 0.78, -0.45, {'share': 0.35}),
         (0.45, 0.78, -0.45, {}),
-        (1.2, 0.3, -0.48, {'has_tables': True}),
+        (1.2, 0.3, -0.48, {'tables': TABLES}),
     ):
-        scan = NumpyBackend().build_grid(hall(height, steepest, **kind)[0], Config())
+        points = hall(height, steepest, **kind).points[:, :3]
+        scan = NumpyBackend().build_grid(np.ascontiguousarray(points), Config())
         plane = fit_plane(in_sight(scan.candidates), 1.0)
-        assert -plane.height == pytest.approx(plane_z, abs=0.03)
         share = mirror_share(plane, scan)
-        assert share > MIRRORED + 0.2 if 'is_polished' in kind else share < MIRRORED - 0.1
+        assert -plane.height == pytest.approx(plane_z, abs=0.03)
+        assert share > MIRRORED + 0.2 if 'share' in kind else share < MIRRORED - 0.1

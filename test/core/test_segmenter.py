@@ -1,19 +1,14 @@
 """The segmenter: properties of its results, history, callers in threads, forks, backends."""
 
 import copy
-import os
 import pickle
 import re
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from unittest.mock import patch
 
 import numpy as np
 import pytest
-from conftest import fewer, hilly_scan
-from reference import Reference
+from conftest import fewer, hilly_scan, run_python
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
 from gp_ground_seg.core.backend import NumpyBackend
@@ -195,41 +190,6 @@ def test_the_input_is_not_written_to_and_may_change_afterwards(backend, scan, ti
         same(result, expected)
 
 
-@cache
-def labelled_by_the_loops(*changes):
-    """Scan of few points with these parameters, for each backend in turn."""
-    return segmenter_of(Reference(), **dict(changes)).segment(hilly_scan(400))
-
-
-@pytest.mark.parametrize(
-    ('model', 'objective'),
-    [
-        ('latent', 'map'),
-        ('line_gradient', 'paper'),
-        ('constant', 'paper'),
-        pytest.param('latent', 'paper', marks=pytest.mark.slow),
-    ],
-)
-def test_frames_are_labelled_as_by_the_loops(backend, model, objective):
-    changes = {
-        'length_scale.model': model,
-        'learning.objective': objective,
-        'learning.length_scale': 'classes' if objective == 'paper' else 'factor',
-        'learning.fixed': 'none' if objective == 'paper' else 'length_scales',
-        'learning.max_evaluations': 3,
-        'grid.n_segments': 12,
-        'grid.n_bins': 60,
-    }
-    found = segmenter_of(backend, **changes).segment(hilly_scan(400))
-    expected = labelled_by_the_loops(*changes.items())
-    np.testing.assert_array_equal(found.label, expected.label)
-    np.testing.assert_array_equal(found.label == Label.GROUND, found.p_ground >= 0.5)
-    np.testing.assert_allclose(found.ground_z, expected.ground_z, atol=1e-5)
-    np.testing.assert_allclose(found.theta, expected.theta, atol=1e-5)
-    assert found.fit.n_evaluations == expected.fit.n_evaluations > 0
-    assert found.fit.objective == pytest.approx(expected.fit.objective, rel=1e-6)
-
-
 def test_stages_are_timed_and_the_fit_report_counts(scan):
     with patch('gp_ground_seg.core.segmenter.perf_counter', map(float, range(100)).__next__):
         result = GroundSegmenter(CONFIG).segment(scan)
@@ -319,9 +279,4 @@ may_end.set()
 
 
 def test_a_process_forked_while_another_thread_segments_segments_too():
-    done = subprocess.run(
-        [sys.executable, '-c', FORK],
-        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)},
-        capture_output=True, text=True, timeout=120.0, check=False,
-    )  # fmt: skip
-    assert done.stdout == '7\n', done.stderr
+    assert run_python(FORK) == ('7\n', '')

@@ -1,12 +1,10 @@
 """The package without its optional compiler, and with the compiler off."""
 
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY, hilly_scan
+from conftest import REPOSITORY, hilly_scan, run_python
 
 from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.core.jit import HAVE_NUMBA
@@ -35,27 +33,24 @@ def test_without_compiled_code_labels_are_the_same_and_one_line_says_so(tmp_path
     """Without numba, with one that cannot be imported, and with compiling switched off."""
     if case == 'plain' and not HAVE_NUMBA:
         pytest.skip('numba is not installed')
-    points, environment = hilly_scan(800), dict(os.environ)
+    points, environment = hilly_scan(800), {}
     np.save(tmp_path / 'points.npy', points)
     if case == 'broken':  # as beside python3-coverage of Ubuntu 24.04
         (tmp_path / 'numba').mkdir()
         (tmp_path / 'numba/__init__.py').write_text("raise AttributeError('no coverage.types')")
         environment['PYTHONPATH'] = f'{tmp_path}{os.pathsep}{REPOSITORY}'
     environment |= {'NUMBA_DISABLE_JIT': '1'} if case == 'plain' else {}
-    done = subprocess.run(
-        [sys.executable, '-c', SCRIPT, case, tmp_path / 'points.npy', tmp_path / 'result.npz'],
-        env=environment, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    words = case, tmp_path / 'points.npy', tmp_path / 'result.npz'
+    said, errors = run_python(SCRIPT, *words, **environment)
     result, expected = np.load(tmp_path / 'result.npz'), GroundSegmenter().segment(points)
     np.testing.assert_array_equal(result['label'], expected.label)
     np.testing.assert_allclose(result['ground_z'], expected.ground_z, atol=1e-6)
-    backend, *by_name = done.stdout.splitlines()
+    backend, *by_name = said.splitlines()
     assert backend == ('numba' if case == 'plain' else 'numpy')
     if case == 'blocked':
-        assert done.stderr.count('numba is not installed') == 1
+        assert errors.count('numba is not installed') == 1
         # By name it is an error.
         assert '-m pip install numba; or set runtime.backend to auto' in by_name[0]
     elif case == 'broken':
         line = 'numba cannot be imported: using numpy, several times slower (no coverage.types)'
-        assert done.stderr == f'{line}\n'
+        assert errors == f'{line}\n'

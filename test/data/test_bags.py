@@ -6,7 +6,6 @@ from functools import partial
 
 import bag_samples as samples
 import pytest
-from rosbags import rosbag2
 from rosbags.highlevel import AnyReader
 
 from gp_ground_seg.core.errors import DataError, MissingDependencyError
@@ -64,20 +63,6 @@ def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
         assert bag.deserialize(raw, POINT_CLOUD2).header.frame_id == 'velo_link'
 
 
-@pytest.mark.parametrize('storage', ['MCAP', 'SQLITE3'])
-@pytest.mark.parametrize('mode', ['FILE', 'MESSAGE'])
-def test_packed_bags_are_read(tmp_path, storage, mode):
-    raw = [encode_cloud(samples.cloud(k)) for k in range(2)]
-    plugin = rosbag2.StoragePlugin[storage]
-    writer = rosbag2.Writer(tmp_path / 'drive', version=9, storage_plugin=plugin)
-    writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
-    with writer:
-        topic = writer.add_connection('/points', POINT_CLOUD2, typestore=jazzy_types())
-        for k, data in enumerate(raw):
-            writer.write(topic, k, data)
-    assert read_all(tmp_path / 'drive') == [('/points', k, data) for k, data in enumerate(raw)]
-
-
 def test_clouds_of_ros1(tmp_path):
     """A definition of another topic that cannot be parsed does not matter."""
     path = tmp_path / 'drive.bag'
@@ -125,36 +110,6 @@ def test_errors_of_the_caller_pass_unchanged(tmp_path):
         next(messages)
         with pytest.raises(KeyError, match='mine'):
             messages.throw(KeyError('mine'))
-
-
-@pytest.mark.parametrize(('name', 'storage'), SHAPES)
-def test_a_bag_is_replaced_with_force_only_and_by_a_whole_one_only(tmp_path, name, storage):
-    path, files = tmp_path / name, []
-
-    def fail_in_the_middle(force):
-        with BagWriter(path, storage=storage, force=force) as bag:
-            bag.add_topic('/points')
-            bag.write('/points', 5, encode_cloud(samples.cloud()))
-            assert listing(tmp_path) != files
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        fail_in_the_middle(force=False)
-    assert listing(tmp_path) == []
-    before = samples.write_ros2_bag(path, storage=storage)
-    files = listing(tmp_path)
-    with pytest.raises(DataError, match='exists already; --force replaces it'):
-        BagWriter(path, storage=storage).__enter__()
-    with pytest.raises(ZeroDivisionError):
-        fail_in_the_middle(force=True)
-    assert listing(tmp_path) == files
-    with BagWriter(path, storage=storage, force=True) as bag:
-        bag.add_topic('/note', 'std_msgs/msg/String')
-        bag.write('/note', 1, samples.string_message('new'))
-        # Until the new one is complete, the old one is there.
-        assert read_all(path) == before
-    assert read_all(path) == [('/note', 1, samples.string_message('new'))]
-    assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
 @pytest.mark.parametrize('name', ['home', 'file', 'folder.mcap'])

@@ -1,13 +1,8 @@
 """Files that are no scan as they are read: what is said, and that good ones are never refused."""
 
-import re
-
 import numpy as np
 import pytest
-from bag_samples import write_ros2_bag
-from cli_runner import error_line, run
 from conftest import simulated
-from evaluation_samples import write_frame
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.cloud_files import find_objection, read_file
@@ -129,29 +124,3 @@ def test_beams_in_turns_and_lost_returns_are_no_other_columns(tmp_path, sensor):
         table = np.where(lost, np.float32(0.0), points)[: len(points) // 840 * 840]
         table.tofile(path)
         np.testing.assert_array_equal(read_points(path), table)
-
-
-def test_commands_refuse_wrong_data_and_name_the_option(tmp_path, capsys):
-    points = simulated('urban', 'hdl-32e', 1).points
-    points = np.hstack([points, points[:, 3:]])[: len(points) // 20 * 20]
-    root, out = tmp_path / 'root', tmp_path / 'out'
-    write_frame(root, '00', 0, points, np.where(points[:, 2] < -1.5, 40, 10).astype('<u4'))
-    scan = root / 'sequences/00/velodyne/000000.bin'
-    for words in (
-        ('segment', scan, '-o', f'{out}.label'), ('segment', root / 'sequences/00', '-o', out),
-        ('plot', 'segment', scan, '--segment', 0, '-o', f'{out}.png'),
-        ('kitti-to-bag', root, '--sequence', '00', f'{out}.mcap'), ('evaluate', root),
-    ):  # fmt: skip
-        assert run(*words) == 2
-        said = error_line(capsys)
-        assert re.search(r'000000\.bin: read with 4 columns .*: use --columns 5$', said)
-    written = {path.name for path in tmp_path.rglob('out*/**/*')} | {*tmp_path.glob('out.*')}
-    assert written <= {'parameters.yaml'}
-    write_ros2_bag(tmp_path / 'a.mcap')
-    for name, n, message in (
-        (tmp_path / 'a.mcap', 5, 'is for .bin scans, which '),
-        (scan, 2, 'at least 3'),
-    ):
-        assert run('segment', name, '-o', f'{out}.label', '--columns', n) == 2
-        assert message in error_line(capsys)
-    assert run('segment', scan, '-o', f'{out}.label', '--columns', '5') == 0

@@ -6,7 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
-from cli_runner import until_ctrl_c
+from cli_runner import PATIENCE, until_ctrl_c
 from conftest import REPOSITORY
 from matplotlib.image import imread
 
@@ -22,8 +22,6 @@ pytestmark = [
     pytest.mark.slow,
 ]
 SCREENSHOTS = REPOSITORY / 'build' / 'screenshots'
-PATIENCE = 120.0
-"""Time to wait for what has to happen [s]; only a failure takes that long."""
 # WebGL by SwiftShader, on the CPU: there is no GPU, and no sandbox for root.
 FLAGS = (
     '--headless=new', '--no-sandbox', '--window-size=1400,1000', '--use-angle=swiftshader',

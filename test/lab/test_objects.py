@@ -27,7 +27,6 @@ from gp_ground_seg.lab.scoring.objects import (
     local_ground,
 )
 
-
 LOW = [*CLASSES].index(LOW_CLASSES[0])
 
 

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from pathlib import Path
 
 import pytest
 from bag_samples import write_ros2_bag
@@ -11,7 +10,6 @@ from evaluation_samples import label_files, write_two_drives
 
 from gp_ground_seg import __version__
 from gp_ground_seg.cli import segment as command
-from gp_ground_seg.data.files import write_file
 from gp_ground_seg.lab.dataset import PARAMETERS
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
@@ -115,22 +113,3 @@ def test_what_is_missing_or_older_than_its_input_is_done_again(segmented, tmp_pa
     assert (out / 'readme').read_text() == 'mine'
     assert run('config', 'check', out / PARAMETERS) == 0
     assert '1 differs from the defaults' in capsys.readouterr().out
-
-
-def test_a_file_has_its_name_when_it_is_on_disk(tmp_path, monkeypatch):
-    """A power failure leaves no hole in what is finished."""
-    calls, sync, rename = [], os.fsync, os.rename
-
-    def note_sync(number):
-        sync(number)
-        calls.append(Path(os.readlink(f'/proc/self/fd/{number}')))
-
-    def note_rename(source, target):
-        rename(source, target)
-        calls.append((source, target))
-
-    monkeypatch.setattr(os, 'fsync', note_sync)
-    monkeypatch.setattr(os, 'rename', note_rename)
-    write_file(tmp_path / 'a', b'1')
-    part, (renamed, target), folder = calls
-    assert (part, target, folder) == (renamed, tmp_path / 'a', tmp_path)

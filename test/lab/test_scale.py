@@ -11,13 +11,14 @@ import time
 from functools import partial
 
 import pytest
-from cli_runner import INTERRUPTED, children, error_line, is_running, run, start, wait_for
+from cli_runner import INTERRUPTED, children, is_running, run, start, wait_for
+from conftest import run_python
 from evaluation_samples import label_files, write_streets, write_two_drives
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import __version__
-from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.errors import DataError, GroundSegError
 from gp_ground_seg.lab import cluster
 
 dask, distributed = pytest.importorskip('dask'), pytest.importorskip('distributed')
@@ -173,6 +174,12 @@ def test_results_are_those_of_one_process_also_if_a_worker_dies(scheduler, tmp_p
             workers.run(_die, [7])
 
 
+def test_a_scheduler_with_keys_answers_nobody_without(locked_scheduler, monkeypatch):
+    monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT', 0.5)
+    with pytest.raises(GroundSegError, match='does not answer'):
+        cluster.open_runner(None, locked_scheduler[0], cluster._NO_BAR).__enter__()
+
+
 def test_workers_speak_tls_and_are_seen_on_this_machine_only():
     spawning = dask.config.set({'distributed.worker.multiprocessing-method': 'spawn'})
     with spawning, cluster.open_runner(1, None, cluster._NO_BAR) as runner:
@@ -181,31 +188,6 @@ def test_workers_speak_tls_and_are_seen_on_this_machine_only():
         sockets = [socket for process in family for socket in process.net_connections()]
         assert {s.laddr.ip for s in sockets if s.status == psutil.CONN_LISTEN} == {'127.0.0.1'}
         assert runner.client.scheduler.address.startswith('tls://')
-
-
-@pytest.mark.parametrize(
-    ('words', 'missing', 'problem'),
-    [
-        ('--workers 99999999999', None, 'four for each processor'),
-        ('--workers 1', 'distributed', 'pip install distributed cryptography'),
-        ('--workers 1', 'cryptography', 'pip install distributed cryptography'),
-        ('--scheduler tcp://127.0.0.1:1', 'distributed', 'pip install distributed cryptography'),
-        ('--scheduler tcp://127.0.0.1:1', None, 'does not answer'),
-        ('--scheduler tls://127.0.0.1:1', None, 'does not answer'),
-        ('--scheduler somewhere', None, 'does not answer'),
-        ('--scheduler LOCKED', None, 'does not answer'),
-    ],
-)
-def test_refused_in_one_line(
-    words, missing, problem, root, locked_scheduler, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT', 0.5)
-    if missing:
-        monkeypatch.setitem(sys.modules, missing, None)
-    words = words.replace('LOCKED', locked_scheduler[0]).split()
-    assert run('segment', root, '-o', tmp_path / 'out', *words) == 2
-    assert problem in error_line(capsys)
-    assert not (tmp_path / 'out').exists()
 
 
 def labels_in(folder):
@@ -296,5 +278,4 @@ def test_one_process_needs_no_dask(root, tmp_path):
     )
     scan = root / 'sequences/00/velodyne/000000.bin'
     words = 'segment', scan, '-o', tmp_path / 'out', '--set', 'runtime.backend=numpy'
-    command = [sys.executable, '-c', code, *words]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    run_python(code, *words)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gp_ground_seg.lab.simulation import DRIVES, SCENES, Kind, objects
+from gp_ground_seg.lab.simulation import DRIVES, SCENES, Kind
 from gp_ground_seg.lab.simulation import terrain as landforms
 from gp_ground_seg.lab.simulation.objects import Box, Cylinder, nearest_solid
 from gp_ground_seg.lab.simulation.terrain import first_hit, polyline
@@ -183,16 +183,6 @@ def test_common_start_gives_what_single_starts_give():
     np.testing.assert_array_equal(fast[0], plain[0])
     np.testing.assert_array_equal(fast[1], plain[1])
     assert np.isfinite(fast[0]).sum() > 500
-
-
-def test_standing_and_floating_solids_follow_the_terrain():
-    hill = landforms.slope(0.1)
-    assert objects.standing_box(hill, 10.0, 0.0, (1.0, 1.0, 0.5)).top == pytest.approx(1.5)
-    deck = objects.floating_box(hill, 20.0, 0.0, (4.0, 8.0, 0.5), 3.0)
-    assert (deck.bottom, deck.top) == pytest.approx((5.0, 5.5))
-    panels = objects.wall(hill, (0.0, 5.0), (30.0, 5.0), 2.0)
-    assert sum(panel.length for panel in panels) == pytest.approx(30.0)
-    assert [panel.top for panel in panels] == pytest.approx([2.0 + 0.1 * p.x for p in panels])
 
 
 @pytest.mark.parametrize('name', DRIVES)

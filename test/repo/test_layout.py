@@ -1,9 +1,6 @@
-"""The shape of the package: rooms by import-linter, and three rules of compiled code."""
+"""The shape of the package: three rules of compiled code; `make lint` has those of the rooms."""
 
 import ast
-import shutil
-import subprocess
-import sys
 from functools import cache
 from pathlib import Path
 
@@ -11,31 +8,6 @@ import pytest
 from conftest import REPOSITORY
 
 PACKAGE = 'gp_ground_seg'
-
-
-WRONG = {
-    'core/pipeline/lines.py': 'from gp_ground_seg.core import segmenter',
-    'ros/input.py': 'from gp_ground_seg.lab.plotting import scan',
-    'data/ply.py': 'import gp_ground_seg.data.cloud_files',
-    'cli/demo.py': 'from rclpy.node import Node',
-    'core/gp/kernels.py': 'from numba import njit',
-}
-
-
-def test_an_import_of_what_lies_above_is_found(tmp_path):
-    """By import-linter, with the contracts of pyproject.toml; `make lint` checks the package."""
-    pytest.importorskip('importlinter', reason='import-linter is not installed')
-    shutil.copytree(REPOSITORY / PACKAGE, tmp_path / PACKAGE)
-    shutil.copy(REPOSITORY / 'pyproject.toml', tmp_path)
-    for path, line in WRONG.items():
-        with open(tmp_path / PACKAGE / path, 'a', encoding='utf-8') as file:
-            file.write(f'\n{line}\n')
-    code = 'import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports())'
-    done = subprocess.run(
-        [sys.executable, '-c', code], cwd=tmp_path, capture_output=True, text=True
-    )
-    said = ' '.join(done.stdout.split()) + done.stderr
-    assert done.returncode == 1 and all(f'.{Path(path).stem} ->' in said for path in WRONG), said
 
 
 @cache
@@ -89,7 +61,7 @@ def find_returned_arrays(trees):
             is_entry = any('entry=True' in mark for mark in marks)
             if is_entry or ('shared' in marks and node.name in entries):
                 names = {n.id for n in ast.walk(node.returns) if isinstance(n, ast.Name)}
-                if names - {'bool', 'int', 'float', 'tuple'}:
+                if names - {'bool', 'int', 'float', 'tuple', 'Plane'}:
                     yield f'{path}: {node.name} returns {ast.unparse(node.returns)}'
 
 

@@ -102,33 +102,6 @@ def test_nothing_is_wrong_with_a_page(page):
     assert len(FIGURES) >= 14
 
 
-@pytest.mark.parametrize(
-    ('fault', 'text'),
-    [
-        ('changed by hand', '<!-- figure: a\n-->\ncommit a\n<!-- end of figure 12345678 -->'),
-        ('not made yet', '<!-- figure: a\n-->\n<!-- end of figure -->'),
-        ('a picture without', '![A hill](docs/images/hill.png)'),
-        ('a table of numbers', '| a |\n| --: |\n| 1 |'),
-        *(
-            ('in a sentence', f'It {said}.')
-            for said in ('has 2.5 % more', 'has an RMSE of 5.95 cm', 'takes 6 ms',
-                         'is two times faster', 'takes 8 times as long', 'takes half of the time')
-        ),
-        *(
-            ('no such place', f'[a]({link})')
-            for link in ('docs/no.md', 'docs/node.md#no', '#no', 'https://arxiv', 'http://a.org/')
-        ),
-        ('odd word', 'It holds for files.'),
-        ('is refused', '```sh\ngp-ground-seg plot scan a.bin --no  # a\n```'),
-        ('is refused', '```sh\ngp-ground-seg no\n```'),
-        ('', 'A slope of 10 to 15 %, `6 ms`, [a](docs/node.md#time-and-tf), [b](https://a.org/1)'),
-    ],
-)  # fmt: skip
-def test_what_is_wrong_with_a_page(fault, text):
-    found = list(faults('README.md', text))
-    assert len(found) == bool(fault) and all(fault in line for line in found), found
-
-
 def test_readme_is_short_the_citation_of_this_version_and_no_command_left_out():
     assert len(TEXTS['README.md'].split()) <= 950
     citation = yaml.safe_load((REPOSITORY / 'CITATION.cff').read_text(encoding='utf-8'))
@@ -215,45 +188,5 @@ def test_commands_of_the_tutorial_run_as_they_stand(block, tmp_path):
     assert done.returncode == 0 and 'Traceback' not in done.stdout, done.stdout
 
 
-PAGE = """\
-# A page
-<!-- figure: experiment scenes --sensors vlp-16
-sample: --scenes kerb
--->
-stale
-<!-- end of figure 12345678 -->
-And text.
-"""
-TABLE = """\
-| a | n | x | y |
-| --- | --: | --: | --: |
-| one | 3 | 1.5 | - |
-| two | 0 | - | - |
-| three | 0 | 0.0 | - |"""
-
-
-def test_a_table_without_empty_rows_and_columns_and_those_that_a_figure_keeps():
-    three = '| one | 3 | 1.5 |\n| three | 0 | 0.0 |'
-    assert figures.trimmed(TABLE) == f'| a | n | x |\n| --- | --: | --: |\n{three}'
-    assert figures.trimmed(TABLE, ['n'], 'one|two') == '| a | x |\n| --- | --: |\n| one | 1.5 |'
-    (figure,) = figures.find_figures('a.md', PAGE.replace('sample:', 'keep: B; C\nsample:'))
-    a, b, c = (f'| {name} |\n| --- |\n| 1 |' for name in 'abc')
-    parts = ['A is', a, 'a note', 'B is', b, 'C', c, 'machine: x', 'result']
-    assert figures.kept(figure, '\n\n'.join(parts)) == '\n\n'.join(parts[3:-1])
-
-
-@pytest.mark.parametrize(
-    ('shown', 'found', 'is_same'),
-    [
-        ('97.50', '97.51', True),
-        ('97.50', '97.52', False),
-        ('+0.10 to +0.30', '+0.10 to +0.30 tie', False),
-        ('1.2e-05', '1.4e-05', False),
-    ],
-)
-def test_samples_that_differ(shown, found, is_same):
-    rows, anew = (
-        ['| scene | IoU |', '| --- | --: |', f'| a | {cell} |'] for cell in (shown, found)
-    )
-    assert list(differences(rows, anew)) == [f'IoU of a: {shown} is {found}'] * (not is_same)
+def test_each_table_has_its_sample_and_no_other_is_kept():
     assert set(figures.read_samples()) == {figure.sample for figure in SAMPLED}
