@@ -57,7 +57,7 @@ def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicl
         paper = config.replace(**{'label.rule': 'tolerance'})
         assert low_sensor.for_sensor(paper, pose) is paper
         # What is at its least already is not refused.
-        names = (*GATES, 'label.ground_tolerance')
+        names = (*GATES, 'label.ground_tolerance', 'grid.r_min')
         tiny = config.replace(**{name: find_spec(name).minimum for name in names})
         assert low_sensor.for_sensor(tiny, pose) == tiny
     # The sensor is where the origin is given to be.

@@ -114,12 +114,13 @@ class GridConfig(ParameterGroup):
     @property
     def start(self) -> float:
         """Range from which bins grow [m]; nearer ones are as wide as the first beyond it."""
-        return max(self.r_min, min(2.0, 0.5 * self.r_max))
+        return float(max(self.r_min, min(2.0, 0.5 * self.r_max)))
 
     @property
     def first_width(self) -> float:
         """Width of the first bin from `start` on, the narrowest of those beyond [m]."""
-        return float(self.r_max - self.start) / float(self.n_bins) ** self.bin_growth
+        width: float = (self.r_max - self.start) / float(self.n_bins) ** self.bin_growth
+        return width
 
     @property
     def n_near(self) -> int:

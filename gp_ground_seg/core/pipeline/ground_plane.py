@@ -83,7 +83,8 @@ RESOLUTION = 4096.0
 """Support by a point at `MIDDLE` exactly on a plane; that of each is a whole number, so that sums
 are exact."""
 N_REFINEMENTS = 13
-MIN_CELLS = 3
+MIN_CELLS = 12
+"""Occupied cells from which a scan has a plane."""
 
 
 class LowestPoints(NamedTuple):

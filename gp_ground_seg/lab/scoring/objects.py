@@ -73,7 +73,9 @@ class Objects(NamedTuple):
     @property
     def can_be_cut(self) -> BoolArray:
         """Which returns lie on objects that are no plants, (N,)."""
-        return (self.class_of >= 0) & (self.class_of != list(CLASSES).index(PLANTS))
+        is_plant = self.class_of == list(CLASSES).index(PLANTS)
+        result: BoolArray = (self.class_of >= 0) & ~is_plant
+        return result
 
 
 OBJECT_COUNTS = ('n_returns', 'n_ground', 'n_objects', 'n_lost')
