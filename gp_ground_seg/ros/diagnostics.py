@@ -200,14 +200,12 @@ def model_status(scan: Segmentation | None, level: str = 'sensor') -> Status:
     """Judge the newest scan, whose tilt is by the `level` of ``frame.level``."""
     if scan is None:
         return Status('model', Level.OK, 'no cloud segmented yet', {})
-    fit, label = scan.fit, scan.label
-    kinds = {'Ground': label == Label.GROUND, 'Unknown': label == Label.UNKNOWN}
+    fit, n_points = scan.fit, max(1, len(scan.label))
+    shares = np.bincount(scan.label, minlength=len(Label)) / n_points
     values = {
         'Segments with a model': f'{fit.n_segments} of {len(scan.surface.mean)}',
-        **{
-            f'{name} fraction': _digits(is_it.mean() if len(label) else None, '.4f')
-            for name, is_it in kinds.items()
-        },
+        'Ground fraction': f'{shares[Label.GROUND]:.4f}',
+        'Unknown fraction': f'{shares[Label.UNKNOWN]:.4f}',
         'Candidates': str(fit.n_candidates),
         'Inliers': str(fit.n_inliers),
         **_pose_values(scan.pose),
