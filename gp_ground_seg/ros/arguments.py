@@ -41,9 +41,9 @@ _RULES = {
     'remap rule': _NAMES,
     'node namespace': _NAMES,
     'parameter override rule': 'must be NAME:=VALUE, as in sensor.height:=1.2',
+    'use_sim_time': 'must be true or false',
     'severity level': 'must be debug, info, warn, error or fatal, or NAME:= one of them',
     'Enclave name': 'as in /front/lidar',
-    'PARAMETER_NOT_SET': f'an empty list: {EMPTY_LIST}',
     'failed to initialize logging': LOG_FOLDER,
     'Failed opening file': LOG_FOLDER,
 }

@@ -143,16 +143,9 @@ class ProcessingTask:
         self._latencies: deque[float] = deque(maxlen=CLOUD_WINDOW)
         self._stages: deque[list[float]] = deque(maxlen=CLOUD_WINDOW)
         self.n_processed = self.n_dropped = 0
-        # Since the last report.
-        self._n_sent_recent = self._n_dropped_recent = 0
+        self._n_reported = 0  # those dropped before the last report
         self._backend = ''
         self._age: float | None = None
-
-    def arrived(self, n_lost: int) -> None:
-        """Count a cloud that arrived, and `n_lost` before it that did not."""
-        self._n_sent_recent += 1 + n_lost
-        self.n_dropped += n_lost
-        self._n_dropped_recent += n_lost
 
     def processed(
         self, latency: float, backend: str, stages: Mapping[str, float], age: float | None
@@ -169,7 +162,7 @@ class ProcessingTask:
     def report(self, limits: DiagnosticsConfig) -> Status:
         """Judge the latest clouds, and the losses since the last report."""
         latency = 1e3 * float(np.median(self._latencies)) if self._latencies else None
-        limit, n_dropped = 1e3 * limits.max_latency, self._n_dropped_recent
+        limit, n_dropped = 1e3 * limits.max_latency, self.n_dropped - self._n_reported
         faults = []
         if latency is not None and latency > limit:
             times = zip(1e3 * np.median(self._stages, axis=0), SLOW.values(), strict=True)
@@ -184,10 +177,8 @@ class ProcessingTask:
                 'what sends it is late, or has another clock'
             )
         if n_dropped:
-            faults.append(
-                f'{n_dropped} of {self._n_sent_recent} clouds dropped since the last report'
-            )
-        self._n_sent_recent = self._n_dropped_recent = 0
+            faults.append(f'clouds dropped since the last report: {n_dropped}')
+        self._n_reported = self.n_dropped
         good = 'no cloud processed yet' if latency is None else f'median latency {latency:.1f} ms'
         values = {
             'Clouds since startup': str(self.n_processed),
@@ -209,14 +200,12 @@ def model_status(scan: Segmentation | None, level: str = 'sensor') -> Status:
     """Judge the newest scan, whose tilt is by the `level` of ``frame.level``."""
     if scan is None:
         return Status('model', Level.OK, 'no cloud segmented yet', {})
-    fit, label = scan.fit, scan.label
-    kinds = {'Ground': label == Label.GROUND, 'Unknown': label == Label.UNKNOWN}
+    fit, n_points = scan.fit, max(1, len(scan.label))
+    shares = np.bincount(scan.label, minlength=len(Label)) / n_points
     values = {
         'Segments with a model': f'{fit.n_segments} of {len(scan.surface.mean)}',
-        **{
-            f'{name} fraction': _digits(is_it.mean() if len(label) else None, '.4f')
-            for name, is_it in kinds.items()
-        },
+        'Ground fraction': f'{shares[Label.GROUND]:.4f}',
+        'Unknown fraction': f'{shares[Label.UNKNOWN]:.4f}',
         'Candidates': str(fit.n_candidates),
         'Inliers': str(fit.n_inliers),
         **_pose_values(scan.pose),
@@ -271,7 +260,6 @@ class Diagnostics:
         self.processing = ProcessingTask()
         self._newest: Segmentation | None = None  # its statistics are computed for a report only
         self._node, self._config = node, config
-        self._n_logged = '0'
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         period = config.diagnostics.period
         self._timer = node.create_timer(period, self._publish, clock=STEADY_CLOCK)
@@ -287,7 +275,7 @@ class Diagnostics:
     def arrived(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
         """Count a cloud that came at the time `arrival` [s], and `n_lost` before it."""
         self.input.arrived(arrival, cloud)
-        self.processing.arrived(n_lost)
+        self.processing.n_dropped += n_lost
 
     def published(
         self, scan: Segmentation, arrival: float, stages: Mapping[str, float], age: float | None
@@ -303,43 +291,33 @@ class Diagnostics:
             )
         self.processing.processed(time.monotonic() - arrival, backend, stages, age)
         self._newest = scan
+        logger.info(
+            f'so far: {self.summary()}',
+            skip_first=True,
+            throttle_duration_sec=LOG_PERIOD,
+            throttle_time_source_type=STEADY_CLOCK,
+        )
 
     def summary(self) -> str:
         """Return what became of the clouds so far."""
         n_done, n_lost = self.processing.n_processed, self.processing.n_dropped
-        return f'ends: {n_done} clouds segmented, {n_lost} lost, {self.input.n_refused} refused'
+        return f'{n_done} clouds segmented, {n_lost} lost, {self.input.n_refused} refused'
 
     def _report(self) -> list[Status]:
-        """Return the status of each task; log that the node works, if it does."""
+        """Return the status of each task."""
         now, ros_time = time.monotonic(), 1e-9 * self._node.get_clock().now().nanoseconds
         limits = self._config.diagnostics
-        found = [
+        return [
             self.input.report(now, ros_time, limits),
             self.processing.report(limits),
             model_status(self._newest, self._config.frame.level),
         ]
-        values = {name: text for status in found for name, text in status.values.items()}
-        if (n := values['Clouds since startup']) != self._n_logged:
-            self._n_logged = n
-            self._node.get_logger().info(
-                f'clouds segmented so far: {n}, {values["Actual frequency (Hz)"]} Hz, median '
-                f'latency {values["Median latency (ms)"]} ms, share of ground '
-                f'{values["Ground fraction"]}',
-                throttle_duration_sec=LOG_PERIOD,
-                throttle_time_source_type=STEADY_CLOCK,
-            )
-        return found
 
     def _publish(self) -> None:
         array = DiagnosticArray()
         array.header.stamp = self._node.get_clock().now().to_msg()
         node_name = self._node.get_fully_qualified_name()
-        try:
-            statuses = self._report()
-        except Exception as error:
-            # Raised from a timer, it would end the node.
-            statuses = [Status('diagnostics', Level.ERROR, f'{type(error).__name__}: {error}', {})]
-        for status in statuses:
+        for status in self._report():
             message = DiagnosticStatus(
                 level=bytes([status.level]),
                 name=f'{node_name.lstrip("/")}: {status.task}',

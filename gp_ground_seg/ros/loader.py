@@ -48,62 +48,40 @@ def child_command(code: str) -> list[str]:
     return [sys.executable, '-c', _CHILD.format(path=path, code=code)]
 
 
-class BackendLoader:
-    """Makes the compiled backend in a thread, while frames are segmented without it.
+class BackendLoader(threading.Thread):
+    """Makes the compiled backend for `config`, while frames are segmented without it.
 
-    `on_done` is called there when the backend is made or cannot be made; not after `stop`.
+    `on_done` is called in this thread when `backend` is made, or cannot be made, and `error` says
+    why; not after `close`.
     """
 
     error = ''
     seconds = 0.0
-    is_started = False
-    is_ready = False
-    """Whether `take_backend` has a result that was not taken yet."""
-    _backend: Backend | None = None
-    _is_stopped = False
+    is_done = False
+    backend: Backend | None = None
+    _is_closed = False
     _compiler: subprocess.Popen[bytes] | None = None
-    _thread: threading.Thread | None = None
 
-    def __init__(self, on_done: Callable[[], None]) -> None:
-        self._on_done = on_done
+    def __init__(self, config: Config, on_done: Callable[[], None]) -> None:
+        super().__init__(daemon=True)
+        self._config, self._on_done = config, on_done
         self._lock = threading.Lock()
 
-    @property
-    def is_busy(self) -> bool:
-        """Whether the thread runs."""
-        return self._thread is not None and self._thread.is_alive()
-
-    def start(self, config: Config) -> None:
-        """Begin to make the backend for `config`."""
-        self.is_started = True
-        self._thread = threading.Thread(target=self._run, args=(config,), daemon=True)
-        self._thread.start()
-
-    def take_backend(self) -> Backend | None:
-        """Return the backend, once; None if it cannot be made, and `error` says why."""
-        backend, self._backend, self.is_ready = self._backend, None, False
-        return backend
-
-    def stop(self) -> None:
-        """End the compiling process; `on_done` is not called from now on."""
-        with self._lock:
-            self._is_stopped = True
-            if self._compiler is not None:
-                self._compiler.kill()
-
     def close(self) -> None:
-        """Stop, and wait for the thread.
+        """End the compiling process, and wait for the thread; `on_done` is not called any more.
 
         Not for one that compiles in this process, where no folder can keep the code: that takes
         20 to 60 s.
         """
-        self.stop()
-        if self._thread is not None:
-            self._thread.join(JOIN_TIMEOUT)
+        with self._lock:
+            self._is_closed = True
+            if self._compiler is not None:
+                self._compiler.kill()
+        self.join(JOIN_TIMEOUT)
 
-    def _run(self, config: Config) -> None:
+    def run(self) -> None:
+        """Make it."""
         start = time.monotonic()
-        backend = None
         try:
             # It declares the compiled functions: then it is known which of them are on disk.
             import gp_ground_seg.core.compiled.backend  # noqa: F401
@@ -112,21 +90,22 @@ class BackendLoader:
 
             if code_folder() is not None and not is_code_kept():
                 self._compile()
-            if not self._is_stopped:
+            if not self._is_closed:
                 # Not with a given height: the scan that is segmented here has another.
-                backend = warm_up(dataclasses.replace(config, sensor=Config().sensor))
+                config = dataclasses.replace(self._config, sensor=Config().sensor)
+                self.backend = warm_up(config)
         except Exception as error:
             self.error = f'{type(error).__name__}: {error}'
         self.seconds = time.monotonic() - start
         with self._lock:
-            if not self._is_stopped:
-                self._backend, self.is_ready = backend, True
+            if not self._is_closed:
+                self.is_done = True
                 self._on_done()
 
     def _compile(self) -> None:
         """Compile in a child process, whose memory is free after it: twice what the node needs."""
         with self._lock:
-            if self._is_stopped:
+            if self._is_closed:
                 return
             self._compiler = subprocess.Popen(
                 child_command(_COMPILE),
@@ -139,6 +118,6 @@ class BackendLoader:
             assert self._compiler.stderr is not None
             said = self._compiler.stderr.read().decode(errors='replace').strip()
             code = self._compiler.wait()
-        if code and not self._is_stopped:
+        if code and not self._is_closed:
             reason = said.splitlines()[-1] if said else f'exit code {code}'
             raise RuntimeError(f'the compiling process failed: {reason}')

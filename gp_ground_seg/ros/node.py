@@ -94,7 +94,7 @@ class GroundSegmentationNode(ConfiguredNode):
         self._segmenter = GroundSegmenter(self.config, backend=NumpyBackend())
         self._is_compiled = False
         self._kept = KeptPose()
-        self._loader = BackendLoader(self._loaded.trigger)
+        self._loader: BackendLoader | None = None
 
     def _start(self) -> None:
         logger = self.get_logger()
@@ -185,22 +185,23 @@ class GroundSegmentationNode(ConfiguredNode):
             self.get_logger().info(message)
 
     def _load_backend(self, config: Config) -> None:
-        if not self._loader.is_started and choose_backend(config.runtime.backend) == 'numba':
+        if self._loader is None and choose_backend(config.runtime.backend) == 'numba':
             self.get_logger().info(FOLLOWS)
-            self._loader.start(config)
+            self._loader = BackendLoader(config, self._loaded.trigger)
+            self._loader.start()
 
     def _change_backend(self) -> None:
         """Use the compiled backend from the next cloud on, if the parameters still say so."""
-        if not self._loader.is_ready:
-            return
-        backend = self._loader.take_backend()
-        if backend is None:
-            self.get_logger().warning(f'{STAYS}: {self._loader.error}')
+        loader = self._loader
+        if loader is None or not loader.is_done:
+            return  # it was one that is closed now
+        if loader.backend is None:
+            self.get_logger().warning(f'{STAYS}: {loader.error}')
             return
         self._is_compiled = True
         if choose_backend(self.config.runtime.backend) == 'numba':
-            self._segmenter.use_backend(backend)
-            self.get_logger().info(f'{CHANGED}, after {self._loader.seconds:.1f} s')
+            self._segmenter.use_backend(loader.backend)
+            self.get_logger().info(f'{CHANGED}, after {loader.seconds:.1f} s')
         # Makes another backend if `runtime` has changed meanwhile.
         self._segmenter.configure(self.config)
 
@@ -215,10 +216,9 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def destroy_node(self) -> None:
         """Free what the node holds."""
-        self._loader.stop()
-        # Before the thread of the loader, which may end late.
+        if self._loader is not None:
+            self._loader.close()
         super().destroy_node()
-        self._loader.close()
         self._library_log.close()
 
     def _on_time_jump(self, seconds: float) -> None:
@@ -295,7 +295,8 @@ class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[m
     def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Free the backend."""
         self._is_configured = False
-        self._loader.close()
+        if self._loader is not None:
+            self._loader.close()
         self._make_segmenter()
         return self._set_active(False)
 
@@ -367,7 +368,7 @@ def main(args: Sequence[str] | None = None, *, is_managed: bool = False) -> int:
             for line in unused_files(words, node.get_fully_qualified_name()):
                 node.get_logger().warning(line)
             _spin(node, stop)
-            node.get_logger().info(node._diagnostics.summary())
+            node.get_logger().info(f'ends: {node._diagnostics.summary()}')
         except GroundSegError as error:
             problem = with_file(str(error), words)
             sys.stderr.write(f'{NODE_NAME}: error: {shown(problem)}\n')
@@ -376,7 +377,7 @@ def main(args: Sequence[str] | None = None, *, is_managed: bool = False) -> int:
             if node is not None:
                 node.destroy_node()
             rclpy.try_shutdown()
-    if node is not None and node._loader.is_busy:
+    if node is not None and node._loader is not None and node._loader.is_alive():
         # The end of the interpreter would wait for LLVM, for ten seconds and more.
         os._exit(0)
     return 0

@@ -188,7 +188,8 @@ class OutputPublishers:
     def __init__(self, node: Node) -> None:
         options = {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
         self._publishers = [
-            (o, node.create_publisher(o.message_type, o.topic, o.profile, **options))
+            # A copy: rclpy writes qos_overrides of this node into it.
+            (o, node.create_publisher(o.message_type, o.topic, copy(o.profile), **options))
             for o in OUTPUTS
         ]
 

@@ -13,11 +13,10 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
-from rclpy.qos import qos_profile_parameters
 
 from gp_ground_seg.core.errors import ConfigError, GroundSegError
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.core.parameters.schema import OF_EVERY_NODE, ParameterSpec
+from gp_ground_seg.core.parameters.schema import EMPTY_LIST, ParameterSpec
 from gp_ground_seg.ros.arguments import start_errors
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
 
@@ -75,41 +74,26 @@ class ConfiguredNode(Node):  # type: ignore[misc]
     """
 
     def __init__(self, name: str, **options: Any) -> None:
-        # Declared from the overrides to learn which names were given; then again, typed.
         with start_errors():
-            super().__init__(
-                name,
-                automatically_declare_parameters_from_overrides=True,
-                start_parameter_services=False,
-                **options,
-            )
-        given = self.get_parameters_by_prefix('')
-        for inherited in OF_EVERY_NODE:
-            given.pop(inherited, None)
-        # rclpy logs the error and goes on.
-        use_sim_time = self.get_parameter('use_sim_time').value
-        if not isinstance(use_sim_time, bool):
-            raise ConfigError(f'use_sim_time = {use_sim_time!r}: must be true or false')
-        check_overrides({name: parameter.value for name, parameter in given.items()})
-        self._config = changed(Config(), given.values())
+            super().__init__(name, start_parameter_services=False, **options)
+        given = {name: parameter.value for name, parameter in self._parameter_overrides.items()}
+        for empty in [name for name, value in given.items() if value is None]:
+            raise ConfigError(f'{empty} is an empty list: {EMPTY_LIST}')
+        check_overrides(given)
+        self._config = changed(Config(), self._parameter_overrides.values())
         self.check_config(self._config)
-        for parameter_name in given:
-            self.undeclare_parameter(parameter_name)
         with start_errors():
             for spec in parameter_specs():
                 value = self._config[spec.name]
                 self.declare_parameter(spec.name, value, descriptor(spec), ignore_override=True)
-        self._given = given
         self.add_pre_set_parameters_callback(lambda parameters: list(map(_typed, parameters)))
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._post_set)
         self._parameter_service = ParameterService(self)
         # Of rclpy's own, a value of unknown type ends the executor, and one sets one by one.
         ours = {SetParameters: self._on_request, SetParametersAtomically: self._on_atomic_request}
-        for setter in [service for service in self.services if service.srv_type in ours]:
-            kind, name = setter.srv_type, setter.srv_name
-            self.destroy_service(setter)
-            self.create_service(kind, name, ours[kind], qos_profile=qos_profile_parameters)
+        for service in self.services:
+            service.callback = ours.get(service.srv_type, service.callback)
 
     @property
     def config(self) -> Config:
@@ -124,7 +108,7 @@ class ConfiguredNode(Node):  # type: ignore[misc]
 
     def warn_of_unused_parameters(self) -> None:
         """Log what was given and is not declared; call it after all topics are made."""
-        for name in sorted(self._given):
+        for name in sorted(self._parameter_overrides):
             if not self.has_parameter(name):
                 is_qos = name.startswith(QOS_OVERRIDES)
                 reason = 'no such topic or policy here' if is_qos else _unknown(name)
@@ -157,38 +141,29 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         return response
 
     def _set_all(self, messages: Iterable[ParameterMessage]) -> Result:
-        parameters = []
-        for message in messages:
-            try:
-                parameters.append(Parameter.from_parameter_msg(message))
-            except ValueError as error:  # a type that ROS does not have
-                return Result(successful=False, reason=f'{message.name}: {error}')
-        return self.set_parameters_atomically(parameters)
+        try:
+            parameters = [Parameter.from_parameter_msg(message) for message in messages]
+            return self.set_parameters_atomically(parameters)
+        except Exception as error:  # the caller would get no answer
+            reason = f'{type(error).__name__}: {error}'
+            self.get_logger().error(f'parameters could not be set: {reason}')
+            return Result(successful=False, reason=reason)
 
     def _on_set(self, parameters: list[Parameter]) -> Result:
-        # An exception out of here would leave the caller waiting.
-        reason = ''
         try:
             self.check_config(changed(self._config, parameters))
         except GroundSegError as error:
-            reason = str(error)
-        except Exception as error:
-            reason = f'{type(error).__name__}: {error}'
-            self.get_logger().error(f'parameters could not be checked: {reason}')
-        return Result(successful=not reason, reason=reason)
+            return Result(successful=False, reason=str(error))
+        return Result(successful=True)
 
     def _post_set(self, parameters: list[Parameter]) -> None:
-        try:
-            config = changed(self._config, parameters)
-            if config != self._config:
-                self.apply_config(config)
-                before, self._config = self._config, config
-                for name, value in config.flat().items():
-                    if value != before[name]:
-                        self.get_logger().info(f'{name}: {before[name]} -> {value}')
-        except Exception as error:
-            reason = f'{type(error).__name__}: {error}'
-            self.get_logger().error(f'parameters could not be applied: {reason}')
+        config = changed(self._config, parameters)
+        if config != self._config:
+            self.apply_config(config)
+            before, self._config = self._config, config
+            for name, value in config.flat().items():
+                if value != before[name]:
+                    self.get_logger().info(f'{name}: {before[name]} -> {value}')
 
 
 def _typed(parameter: Parameter) -> Parameter:

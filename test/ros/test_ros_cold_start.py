@@ -82,16 +82,15 @@ def test_a_failure_is_a_warning_and_the_node_goes_on(monkeypatch, tmp_path):
         assert b.node._segmenter.backend.name == 'numpy'
 
 
-def test_loader_that_is_closed_calls_nobody_and_frees_its_backend(held_back):
+def test_loader_that_is_closed_calls_nobody(held_back):
     calls = []
-    made = BackendLoader(lambda: calls.append(1))
-    made.start(Config())
-    assert made.is_busy
-    made.stop()
-    held_back.set()
+    made = BackendLoader(Config(), lambda: calls.append(1))
+    made.start()
     made.close()
-    assert calls == [] and not made.is_busy
-    assert made.take_backend() is None
+    assert made.is_alive()
+    held_back.set()
+    made.join(60.0)
+    assert calls == [] and not made.is_done
 
 
 def test_warm_up_command_says_where_the_code_is(capsys):

@@ -139,10 +139,10 @@ def test_drops_are_a_warning_once_and_counted_for_ever():
     # Also before a cloud is processed, as while the first takes long.
     statistics, reports = ProcessingTask(), []
     for n_lost in (0, 3, 0):
-        statistics.arrived(n_lost)
+        statistics.n_dropped += n_lost
         reports.append(statistics.report(LIMITS))
     assert [report.level for report in reports] == [Level.OK, Level.WARN, Level.OK]
-    assert reports[1].message == '3 of 4 clouds dropped since the last report'
+    assert reports[1].message == 'clouds dropped since the last report: 3'
     assert [report.values['Dropped since startup'] for report in reports] == ['0', '3', '3']
 
 

@@ -179,6 +179,8 @@ def test_quality_of_service_of_every_output_can_be_overridden():
         for _, publisher in node._outputs._publishers:
             qos = publisher.qos_profile
             assert {'depth': qos.depth, 'reliability': qos.reliability.short_key} == OTHER_QOS
+    # Of this node only.
+    assert {output.profile.depth for output in outputs.OUTPUTS} == {outputs.OUTPUT_DEPTH}
 
 
 # Clouds of four layouts through the real node, over DDS; test_point_cloud2.py has any.

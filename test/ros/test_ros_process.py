@@ -8,14 +8,12 @@ import pytest
 import ros_helpers as ros
 from conftest import REPOSITORY
 from diagnostic_msgs.msg import DiagnosticStatus
-from hypothesis import given
-from hypothesis import strategies as st
 from rcl_interfaces.msg import ParameterType
 from ros_helpers import BEST_EFFORT, NAMESPACE, RELIABLE, street, to_message, wait_for
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan, PointCloud2
 
-from gp_ground_seg.ros.input import NO_TIME, SequenceGaps
+from gp_ground_seg.ros.input import NO_TIME
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -172,7 +170,7 @@ def test_large_clouds_that_come_best_effort_are_a_warning(node, link):
     status = link.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.WARN)
     assert 'clouds of 1.9 MB come best-effort' in status.message
     assert 'FASTRTPS_DEFAULT_PROFILES_FILE' in status.message
-    assert f'on {NAMESPACE}/points, clouds' in node.log
+    node.wait_until_ready(f'on {NAMESPACE}/points, clouds')
 
 
 def test_messages_of_another_type_are_named(node, link):
@@ -195,30 +193,7 @@ def test_messages_of_another_type_are_named(node, link):
         assert status.level == DiagnosticStatus.WARN
         driver.destroy_node()
     link.wait_for_status('input', lambda _, s: wanted not in s.message)
-    assert f'on {NAMESPACE}/points, {wanted}' in node.log
-
-
-def test_gaps_are_those_in_the_numbers_of_one_publisher():
-    """Of another one, which counts from 1, and of a middleware without numbers, none is known."""
-    gaps = SequenceGaps()
-    assert [gaps.note(n) for n in (7, 8, 1, 2, 5, None, 200)] == [0, 0, 0, 0, 2, 0, 0]
-    assert [gaps.note(n) for n in (None, 3, 5)] == [0, 0, 1]
-
-
-@given(st.lists(st.tuples(st.booleans(), st.integers(0, 5)), max_size=50), st.booleans())
-def test_gaps_of_two_publishers_add_up(steps, are_near):
-    gaps, last = SequenceGaps(), [1000, 1000 if are_near else 1]
-    assert [gaps.note(number, 2) for number in last] == [0, 0]
-    counted = lost = 0
-    for which, n_lost in steps:
-        last[which] += 1 + n_lost
-        counted += gaps.note(last[which], 2)
-        lost += n_lost
-    # Of numbers that are near, a loss may be counted with the next cloud of either.
-    for which in sorted((0, 1), key=last.__getitem__):
-        last[which] += 1
-        counted += gaps.note(last[which], 2)
-    assert counted == lost
+    node.wait_until_ready(f'on {NAMESPACE}/points, {wanted}')
 
 
 # Sends best-effort clouds of 1.9 MB until it is ended; its domain is that of the environment.
