@@ -9,13 +9,13 @@ rosbags for single MCAP files: a channel of protobuf or JSON, or no profile, sto
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack
-from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -245,15 +245,8 @@ class BagReader(AbstractContextManager['BagReader']):
 
     def pick_point_cloud_topic(self, topic: str | None = None) -> str:
         """Return `topic` if it has point clouds, or the only one that has; else a DataError."""
-        clouds = [name for name, kind in self.topics.items() if kind == POINT_CLOUD2]
-        if topic is not None:
-            self.n_messages(topic)
-            if topic not in clouds:
-                raise DataError(
-                    f'{self.path}: topic {topic} is of type {self.topics[topic]}, must be '
-                    f'{POINT_CLOUD2}; such topics here: {", ".join(clouds) or "none"}'
-                )
-            clouds = [topic]
+        wanted = [topic] if topic else self.topics
+        clouds = [name for name in wanted if self.topics.get(name) == POINT_CLOUD2]
         recorded = [name for name in clouds if self.n_messages(name)]
         if len(recorded) == 1:
             return recorded[0]
@@ -263,7 +256,8 @@ class BagReader(AbstractContextManager['BagReader']):
         elif clouds:
             problem = f'no message on {", ".join(clouds)}'
         else:
-            problem = f'no {POINT_CLOUD2} topic; topics here: {self._list_topics()}'
+            named = f' {topic}' if topic else ''
+            problem = f'no {POINT_CLOUD2} topic{named}; topics here: {self._list_topics()}'
         raise DataError(f'{self.path}: {problem}')
 
     def messages(self, topics: Collection[str] | None = None) -> _Messages:
@@ -359,9 +353,8 @@ def stamp_of(cloud: CloudMessage) -> tuple[int, int]:
 
 def with_stamp(cloud: CloudMessage, stamp: tuple[int, int]) -> CloudMessage:
     """Copy of a message with another stamp, in s and ns; the points are shared."""
-    moved = copy(cloud)
-    moved.header = _new_header(stamp, cloud.header.frame_id)
-    return moved
+    header = _new_header(stamp, cloud.header.frame_id)
+    return dataclasses.replace(cloud, header=header)  # type: ignore[type-var]
 
 
 def cloud_from_columns(

@@ -9,6 +9,7 @@ Source: http://paulbourke.net/dataformats/ply/.
 from __future__ import annotations
 
 import logging
+import re
 from typing import Any, Literal
 
 import numpy as np
@@ -53,16 +54,14 @@ def read_ply(data: bytes) -> tuple[Fields, list[str]]:
     entries = [line.split() for line in lines if line not in remarks]
     form = ' '.join(next((words[1:2] for words in entries if words[0] == 'format'), [])).lower()
     starts = [k for k, words in enumerate(entries) if words[0] == 'element']
-    elements = [' '.join(entries[k][1:]) for k in starts]
-    kind, _, count = elements[0].partition(' ') if elements else ('', '', '')
-    if lines[0].lower() != 'ply' or form not in _ORDERS or kind != 'vertex':
-        found = ', '.join(elements) or 'none'
+    elements = ', '.join(' '.join(entries[k][1:]) for k in starts)
+    vertices = re.match(r'vertex (\d+)(, |$)', elements, re.ASCII)
+    if lines[0].lower() != 'ply' or form not in _ORDERS or vertices is None:
         raise PointCloudError(
-            f'no PLY with vertices as its first element: format {form}, elements {found}'
+            'no PLY with a number of vertices as its first element: '
+            f'format {form}, elements {elements or "none"}'
         )
-    if not count.isdecimal():
-        raise PointCloudError(f'element vertex {count}: must have a whole number')
-    n_points, order = int(count), _ORDERS[form]
+    n_points, order = int(vertices[1]), _ORDERS[form]
     begin, end = [*starts, len(entries)][:2]
     properties = [words for words in entries[begin:end] if words[0] == 'property']
     dtype, lists = _types_of(properties, order)

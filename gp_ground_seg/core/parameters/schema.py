@@ -6,11 +6,10 @@ import contextlib
 import dataclasses
 import difflib
 import functools
-import math
 import numbers
 import re
 import textwrap
-from collections import namedtuple
+from collections import Counter, namedtuple
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -340,13 +339,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f'; did you mean {near[0]}?' if near else ''
 
 
-class _Loader(yaml.BaseLoader):
+class _Loader(yaml.SafeLoader):
     """Reads plain words as ROS's own parser, rcl_yaml_param_parser, does.
 
     YAML 1.1 has more: ``1_80`` and ``1:20`` are integers there, ``2026-11-28`` is a date.
     """
 
-    DEFAULT_SCALAR_TAG: Any = ''  # type: ignore[misc]  # a word behind ``!!str`` has another
+    bool_values: ClassVar[Any] = {**yaml.SafeLoader.bool_values, 'y': True, 'n': False}
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """Refuse aliases, as ROS does: a kilobyte of them can stand for gigabytes."""
@@ -356,41 +355,27 @@ class _Loader(yaml.BaseLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Refuse a key that is there twice; the last would win silently."""
-        values: dict[Any, Any] = {}
-        for key, value in node.value:
-            name = super().construct_scalar(key)
-            if name in values:
-                raise ConfigError(f'{name}: given twice, line {key.start_mark.line + 1}')
-            values[name] = self.construct_object(value, deep=True)
-        return values
-
-    def construct_scalar(self, node: yaml.ScalarNode) -> Any:
-        """Return a switch or a number where a plain word is one, and None where there is none."""
-        text = super().construct_scalar(node)
-        if node.style in ('"', "'") or node.tag == 'tag:yaml.org,2002:str':
-            return text
-        if text in _SWITCHES:
-            return _SWITCHES[text]
-        if not text.isascii() or '_' in text:  # which Python has in numbers, and C has not
-            return text
-        word = text.lower().replace('.inf', 'inf').replace('.nan', 'nan')
-        is_octal = word.lstrip('+-').isdigit() and word.lstrip('+-')[0] == '0'
-        with contextlib.suppress(ValueError):
-            number = int(word, 16 if 'x' in word else 8 if is_octal else 10)
-            if -(2**63) <= number < 2**63:
-                return number
-        with contextlib.suppress(ValueError, OverflowError):
-            value = float.fromhex(word) if 'x' in word else float(word)
-            if math.isfinite(value) or 'n' in word:
-                return value
-        return text or None
+        for name, n_times in Counter(str(key.value) for key, _ in node.value).items():
+            if n_times > 1:
+                raise ConfigError(f'{name}: given twice, line {node.start_mark.line + 1}')
+        return super().construct_mapping(node, deep)
 
 
-_SWITCHES = {
-    form: word in ('y', 'yes', 'true', 'on')
-    for word in ('y', 'yes', 'true', 'on', 'n', 'no', 'false', 'off')
-    for form in (word, word.capitalize(), word.upper())
+_SWITCHES = 'y', 'yes', 'true', 'on', 'n', 'no', 'false', 'off'
+_WORDS = {
+    'null': '',
+    'bool': '|'.join(f'{word}|{word.capitalize()}|{word.upper()}' for word in _SWITCHES),
+    'int': '[-+]?(0[0-7]*|[1-9][0-9]{,17}|0x[0-9a-fA-F]{1,15})',
+    'float': r'[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?\.?(?i:inf|nan)',
 }
+_Loader.yaml_implicit_resolvers = {}
+for _kind, _form in _WORDS.items():
+    _Loader.add_implicit_resolver(f'tag:yaml.org,2002:{_kind}', re.compile(rf'({_form})\Z'), None)
+# What launch_ros writes for a list, which rcl reads as one.
+_Loader.add_constructor(
+    'tag:yaml.org,2002:python/tuple',
+    _Loader.construct_sequence,  # type: ignore[type-var]
+)
 
 
 def read_yaml(path: str | Path) -> object:
