@@ -181,11 +181,11 @@ def _open_mcap(path: Path, stack: ExitStack) -> _Contents:
             if channel.message_encoding == 'cdr':
                 yield channel.topic, message.log_time, message.data
 
-    found = []
-    for c in channels.values():
-        msgtype = schemas[c.schema_id].name if c.schema_id else 'no type'
-        found.append(_Channel(c.topic, msgtype, c.message_encoding, counts.get(c.id, 0)))
-    return found, read
+    kinds = {0: 'no type', **{number: schema.name for number, schema in schemas.items() if number}}
+    return [
+        _Channel(c.topic, kinds[c.schema_id], c.message_encoding, counts.get(c.id, 0))
+        for c in channels.values()
+    ], read
 
 
 class BagReader(AbstractContextManager['BagReader']):

@@ -169,19 +169,16 @@ def _views(
 
 def _check_field(field: Any, accepted: Collection[int], point_step: int) -> None:
     """Raise PointCloudError unless a field is of an accepted type and within the point."""
-    problem = ''
+    what = f'point cloud: field {field.name}'
     if field.datatype not in accepted:
         kind = _DATATYPE_NAMES.get(field.datatype, 'unknown')
         wanted = ' or '.join(f'{_DATATYPE_NAMES[datatype]} ({datatype})' for datatype in accepted)
-        problem = f'has datatype {field.datatype} ({kind}): must be {wanted}'
-    else:
-        n_bytes = max(field.count, 1) * int(_CODES[field.datatype][1])
-        # numpy adds in 32 bits, and would read outside of the data.
-        if not 0 <= field.offset <= point_step - n_bytes:
-            place = f'at offset {field.offset} of {n_bytes} bytes'
-            problem = f'{place}: must end within point_step {point_step}'
-    if problem:
-        raise PointCloudError(f'point cloud: field {field.name} {problem}')
+        raise PointCloudError(f'{what} has datatype {field.datatype} ({kind}): must be {wanted}')
+    n_bytes = max(field.count, 1) * int(_CODES[field.datatype][1])
+    # numpy adds in 32 bits, and would read outside of the data.
+    if not 0 <= field.offset <= point_step - n_bytes:
+        place = f'at offset {field.offset} of {n_bytes} bytes'
+        raise PointCloudError(f'{what} {place}: must end within point_step {point_step}')
 
 
 def _view(cloud: CloudMessage, code: npt.DTypeLike, offset: int = 0) -> npt.NDArray[Any]:
@@ -192,19 +189,16 @@ def _view(cloud: CloudMessage, code: npt.DTypeLike, offset: int = 0) -> npt.NDAr
         return np.empty((height, width), code)
     needed = (height - 1) * row_step + row_bytes
     raw = np.frombuffer(cloud.data, dtype=np.uint8)
-    problem = ''
-    if point_step < 1:
-        problem = f'point_step {point_step}: must be at least 1 byte'
-    elif height > 1 and row_step < row_bytes:
-        problem = f'row_step {row_step}: must be at least {row_bytes} '
-        problem += f'(width {width} * point_step {point_step})'
-    elif len(raw) < needed:
-        layout = f'height {height}, width {width}, point_step {point_step}, row_step {row_step}'
-        problem = f'data of {len(raw)} bytes: must be at least {needed} ({layout})'
-    elif row_step > len(raw):
-        problem = f'row_step {row_step}: must be at most the {len(raw)} bytes of data'
-    if problem:
-        raise PointCloudError(f'point cloud: {problem}')
+    rules = (
+        (f'point_step {point_step}', point_step >= 1, 'at least 1 byte'),
+        (f'row_step {row_step}', height == 1 or row_step >= row_bytes, f'at least {row_bytes}'),
+        (f'data of {len(raw)} bytes', len(raw) >= needed, f'at least {needed}'),
+        (f'row_step {row_step}', row_step <= len(raw), f'at most the {len(raw)} bytes of data'),
+    )
+    layout = f'height {height}, width {width}, point_step {point_step}, row_step {row_step}'
+    for what, holds, bound in rules:
+        if not holds:
+            raise PointCloudError(f'point cloud: {what}: must be {bound} ({layout})')
     view: npt.NDArray[Any] = np.ndarray((height, width), code, raw, offset, (row_step, point_step))
     return view
 

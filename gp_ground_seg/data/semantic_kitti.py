@@ -97,10 +97,11 @@ def list_frames(root: str | Path, sequence: str, columns: int = KITTI_COLUMNS) -
     if not paths:
         raise DataError(f'{folder / "velodyne"}: no .bin file in it')
     labels = {path.stem: path for path in (folder / 'labels').glob('*.label')}
-    frames = []
-    for path, time in zip(paths, _read_times(folder / 'times.txt', paths), strict=True):
-        frames.append(Frame(sequence, path.stem, path, labels.get(path.stem), time, columns))
-    return frames
+    pairs = zip(paths, _read_times(folder / 'times.txt', paths), strict=True)
+    return [
+        Frame(sequence, path.stem, path, labels.get(path.stem), time, columns)
+        for path, time in pairs
+    ]
 
 
 def labelled_frames(

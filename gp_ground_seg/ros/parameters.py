@@ -9,11 +9,9 @@ from typing import Any
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import SetParametersResult as Result
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
-from rclpy.qos import qos_profile_parameters
 
 from gp_ground_seg.core.errors import ConfigError, GroundSegError
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
@@ -40,7 +38,6 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     if spec.type is float:
         result.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
     elif spec.type is int:
-        assert low is not None and high is not None
         result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     return result
 
@@ -65,6 +62,35 @@ def describe(config: Config, node_name: str) -> str:
     head = 'parameters that differ from the defaults' if lines else 'parameters: all defaults'
     how = f'all values by ros2 param dump {node_name}, explained by gp-ground-seg config dump'
     return f'{head} ({how}){":" if lines else ""}{"".join(lines)}'
+
+
+class _ParameterService(ParameterService):  # type: ignore[misc]
+    """Refuses a value of unknown type, which ends the executor of rclpy's own, and sets at once.
+
+    ``ros2 param load`` sends a whole file: one by one, a value that contradicts another still to
+    come would be refused.
+    """
+
+    def _set_parameters_callback(self, request: Any, response: Any) -> Any:
+        """Set all at once, or one by one if that is refused."""
+        messages = request.parameters
+        results = [self._set_all(messages)] * len(messages)
+        if not all(result.successful for result in results):
+            results = [self._set_all([message]) for message in messages]
+        response.results = results
+        return response
+
+    def _set_parameters_atomically_callback(self, request: Any, response: Any) -> Any:
+        response.result = self._set_all(request.parameters)
+        return response
+
+    def _set_all(self, messages: Iterable[ParameterMessage]) -> Result:
+        try:
+            given = [Parameter.from_parameter_msg(message) for message in messages]
+        except ValueError as error:  # a type that ROS does not have
+            names = ', '.join(message.name for message in messages)
+            return Result(successful=False, reason=f'{names}: {error}')
+        return self._get_node().set_parameters_atomically(given)
 
 
 class ConfiguredNode(Node):  # type: ignore[misc]
@@ -103,13 +129,7 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         self.add_pre_set_parameters_callback(lambda parameters: list(map(_typed, parameters)))
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._post_set)
-        self._parameter_service = ParameterService(self)
-        # Of rclpy's own, a value of unknown type ends the executor, and one sets one by one.
-        ours = {SetParameters: self._on_request, SetParametersAtomically: self._on_atomic_request}
-        for setter in [service for service in self.services if service.srv_type in ours]:
-            kind, name = setter.srv_type, setter.srv_name
-            self.destroy_service(setter)
-            self.create_service(kind, name, ours[kind], qos_profile=qos_profile_parameters)
+        self._parameter_service = _ParameterService(self)
 
     @property
     def config(self) -> Config:
@@ -137,33 +157,6 @@ class ConfiguredNode(Node):  # type: ignore[misc]
                 return Result(successful=False, reason=_unknown(parameter.name))
         result = self._on_set(parameter_list)
         return super().set_parameters_atomically(parameter_list) if result.successful else result
-
-    def _on_request(self, request: Any, response: Any) -> Any:
-        """Set all at once, or one by one if that is refused.
-
-        ``ros2 param load`` sends a whole file: one by one, a value that contradicts another
-        still to come would be refused.
-        """
-        messages = request.parameters
-        result = self._set_all(messages)
-        if result.successful:
-            response.results = [result] * len(messages)
-        else:
-            response.results = [self._set_all([message]) for message in messages]
-        return response
-
-    def _on_atomic_request(self, request: Any, response: Any) -> Any:
-        response.result = self._set_all(request.parameters)
-        return response
-
-    def _set_all(self, messages: Iterable[ParameterMessage]) -> Result:
-        parameters = []
-        for message in messages:
-            try:
-                parameters.append(Parameter.from_parameter_msg(message))
-            except ValueError as error:  # a type that ROS does not have
-                return Result(successful=False, reason=f'{message.name}: {error}')
-        return self.set_parameters_atomically(parameters)
 
     def _on_set(self, parameters: list[Parameter]) -> Result:
         # An exception out of here would leave the caller waiting.

@@ -31,7 +31,7 @@ NO_BOX: Literal['none'] = 'none'
 ROS_NODE_KEY = '/**'
 NODE_NAME = 'ground_segmentation_node'
 ROS_PARAMETERS_KEY = 'ros__parameters'
-MAX_FILE_BYTES = 1 << 18  # twenty times the largest of config/
+MAX_LENGTH = 1 << 18  # of a file: twenty times the largest of config/
 MAX_VALUES = 500  # of a file: five times those there are
 YAML_SUFFIXES = ('.yaml', '.yml')
 NO_VALUES = 'no parameters of the segmentation in it'
@@ -381,16 +381,15 @@ _Loader.add_constructor(
 def read_yaml(path: str | Path) -> object:
     """Read a YAML file as `load_yaml`; ConfigError also if it cannot be read or is too large."""
     try:
-        with open(path, 'rb') as file:
-            data = file.read(MAX_FILE_BYTES + 1)
+        with open(path, encoding='utf-8') as file:
+            text = file.read(MAX_LENGTH + 1)
     except OSError as error:
         raise ConfigError(reason_of(error)) from error
-    if len(data) > MAX_FILE_BYTES:
-        raise ConfigError(f'too large for a parameter file, accepted are {MAX_FILE_BYTES} bytes')
-    try:
-        return load_yaml(data.decode('utf-8'))
     except UnicodeDecodeError as error:
         raise ConfigError('not a text file') from error
+    if len(text) > MAX_LENGTH:
+        raise ConfigError(f'too large for a parameter file, accepted are {MAX_LENGTH} characters')
+    return load_yaml(text)
 
 
 def load_yaml(text: str) -> object:
