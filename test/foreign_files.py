@@ -357,7 +357,7 @@ def folder(change):
     """Function that writes a folder of three clouds, its metadata.yaml changed."""
 
     def write(path):
-        with BagWriter(path, storage='sqlite3') as bag:
+        with BagWriter(path) as bag:
             bag.add_topic('/points')
             for time in range(3):
                 bag.write('/points', time, CLOUD)
@@ -376,6 +376,10 @@ def replaced(old, new):
 REINDEX = r'cannot be read as a bag; .*`ros2 bag reindex` writes metadata\.yaml anew'
 CASES |= {
     'whole_paths': (replaced('- whole', '- /old/whole'), THREE),
+    'too_many': (
+        replaced('message_count: 3', 'message_count: 4'),
+        'topic /points lists 4 messages, 3 could be read',
+    ),
     'null_count': (replaced('message_count: 3', 'message_count:'), 'no message on /points'),
     'windows_paths': (replaced('- windows', r'- C:\logs\windows'), REINDEX),
     'null_compression': (replaced("compression_mode: ''", 'compression_mode:'), REINDEX),

@@ -29,8 +29,7 @@ from gp_ground_seg.data.point_cloud2 import DATATYPES, CloudMessage
 
 POINT_CLOUD2 = 'sensor_msgs/msg/PointCloud2'
 METADATA_FILE = 'metadata.yaml'
-SUFFIX_OF_STORAGE = {'mcap': '.mcap', 'sqlite3': '.db3'}
-STORAGE_OF_SUFFIX = {suffix: storage for storage, suffix in SUFFIX_OF_STORAGE.items()}
+STORAGE_OF_SUFFIX = {'.mcap': 'mcap', '.db3': 'sqlite3'}
 BAG_SUFFIXES = ('.bag', *STORAGE_OF_SUFFIX)
 
 _FOLDER_SUFFIXES = ('.mcap', '.db3', '.db3-shm', '.db3-wal', '.zstd', '.zst')
@@ -94,22 +93,6 @@ def check_sqlite_file(path: Path) -> None:
         if journal.exists() and journal.stat().st_size > 0:
             hint = f'`sqlite3 {path.name} vacuum` completes it'
             raise DataError(f'{path}: was not closed, some of it is in {journal.name}; {hint}')
-
-
-def resolve_storage(path: str | Path, wanted: str | None = None) -> str:
-    """Storage of a new bag: `wanted`, or by its suffix; DataError if the two contradict."""
-    suffix = Path(path).suffix
-    if suffix == '.bag':
-        raise DataError(f'{path}: only ROS 2 bags are written; use .mcap, .db3 or a folder name')
-    implied = STORAGE_OF_SUFFIX.get(suffix)
-    storage = wanted or implied or 'mcap'
-    if implied not in (None, storage):
-        raise DataError(
-            f'{path}: ends in {suffix}, which is not {storage} ({SUFFIX_OF_STORAGE[storage]})'
-        )
-    if storage == 'sqlite3':
-        check_sqlite_path(Path(path))
-    return storage
 
 
 @functools.cache
@@ -290,17 +273,18 @@ class BagReader(AbstractContextManager['BagReader']):
 class BagWriter:
     """A new rosbag2 bag, in a ``with`` statement; written whole or not at all (`staged_file`).
 
-    `path` is a folder as ``ros2 bag record -o`` makes, or a single file, by its suffix; `storage`
-    see `resolve_storage`. With `force` a bag of that name is replaced. Raises DataError if the
-    path is taken or cannot be written, MissingDependencyError without rosbags.
+    `path` is a folder as ``ros2 bag record -o`` makes, stored as MCAP, or a single file, by its
+    suffix. With `force` a bag of that name is replaced. Raises DataError if the path is taken or
+    cannot be written, MissingDependencyError without rosbags.
     """
 
-    def __init__(
-        self, path: str | Path, *, storage: str | None = None, force: bool = False
-    ) -> None:
+    def __init__(self, path: str | Path, *, force: bool = False) -> None:
         require('rosbags.highlevel', 'rosbags')
         self.path = Path(path)
-        self.storage = resolve_storage(path, storage)
+        if self.path.suffix == '.bag':
+            raise DataError(f'{path}: only ROS 2 bags are written; use .mcap, .db3 or a folder')
+        if self.path.suffix == '.db3':
+            check_sqlite_path(self.path)
         self._force = force
         self._connections: dict[str, Any] = {}
 
@@ -313,14 +297,14 @@ class BagWriter:
                 product = stack.enter_context(staged_file(self.path, force=self._force))
                 # rosbags writes folders; the one file in it is named after the folder.
                 folder = product.parent / 'bag' / product.stem
-                file = folder / f'{folder.name}{SUFFIX_OF_STORAGE[self.storage]}'
+                file = folder / f'{folder.name}{self.path.suffix}'
                 stack.push(lambda kind, *_: os.rename(file, product) if kind is None else None)
             else:
                 folder = stack.enter_context(
                     staged_file(self.path, force=self._force, is_kind=is_bag_folder)
                 )
             stack.enter_context(writing(self.path))
-            plugin = StoragePlugin[self.storage.upper()]
+            plugin = StoragePlugin[STORAGE_OF_SUFFIX.get(self.path.suffix, 'mcap').upper()]
             # Version 9 is what Jazzy writes.
             self._writer = stack.enter_context(Writer(folder, version=9, storage_plugin=plugin))
             self._open = stack.pop_all()

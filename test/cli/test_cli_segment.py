@@ -94,7 +94,7 @@ def assert_splits(source, result, topic, segmenter):
         ('drive.mcap', '', 'drive_ground.mcap', 'mcap'),
         ('drive.db3', '', 'drive_ground.db3', 'sqlite3'),
         ('drive.bag', '', 'drive_ground', 'mcap'),
-        ('drive.db3', '-o out', 'out', 'sqlite3'),
+        ('drive.db3', '-o out', 'out', 'mcap'),
         ('drive.db3', '-o out.mcap', 'out.mcap', 'mcap'),
         ('two.mcap', '--topic /front', 'two_ground.mcap', 'mcap'),
         ('two.mcap', '--topic /ground', 'two_ground.mcap', 'mcap'),
