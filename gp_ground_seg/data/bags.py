@@ -182,20 +182,18 @@ class BagReader(AbstractContextManager['BagReader']):
     ----------
     topics : dict of str to str
         Type of the messages of each topic; those not in CDR with their encoding.
-    storage : str
-        ``ros1``, ``mcap`` or ``sqlite3``.
     """
 
     def __init__(self, path: str | Path) -> None:
         require('rosbags.highlevel', 'rosbags mcap')
         self.path = Path(path)
-        self.storage = storage_of(self.path)
+        storage = storage_of(self.path)
         with ExitStack() as stack:
             with self._naming():
                 if self.path.suffix == '.mcap' and self.path.is_file():
                     channels, self._read = _open_mcap(self.path, stack)
                 else:
-                    channels, self._read = _open_ros(self.path, self.storage, stack)
+                    channels, self._read = _open_ros(self.path, storage, stack)
             self._open = stack.pop_all()
         self.topics: dict[str, str] = {}
         self._counts: dict[str, int] = {}

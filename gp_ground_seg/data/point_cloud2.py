@@ -123,17 +123,14 @@ def append_columns(
         placed.append((name, start, DATATYPES[f'{values.dtype.kind}{itemsize}']))
         end = start + itemsize
     step = _round_up(end, _ALIGNMENT)
-    height, width = cloud.height, cloud.width
-    size = height * width
-    wide = np.zeros(size * step, dtype=np.uint8)
-    if size:
-        points = _view(cloud, f'V{cloud.point_step}')
-        np.ndarray((height, width), points.dtype, wide.data, 0, (width * step, step))[...] = points
-        with np.errstate(over='ignore', invalid='ignore'):
-            for name, offset, datatype in placed:
-                code = _code(cloud, datatype)
-                np.ndarray((size,), code, wide.data, offset, (step,))[...] = columns[name]
-    return placed, step, wide
+    points = _view(cloud, f'V{cloud.point_step}')
+    wide = np.zeros((points.size, step), dtype=np.uint8)
+    wide[:, : cloud.point_step].view(points.dtype)[:, 0] = points.reshape(-1)
+    with np.errstate(over='ignore', invalid='ignore'):
+        for name, start, datatype in placed:
+            column = wide[:, start : start + columns[name].itemsize].view(_code(cloud, datatype))
+            column[:, 0] = columns[name]
+    return placed, step, wide.reshape(-1)
 
 
 def _round_up(value: int, multiple: int) -> int:

@@ -68,7 +68,7 @@ def test_sequences_and_frames_are_sorted_and_need_scans(tmp_path):
     with pytest.raises(DataError, match='sequences here: 00, 08, 10'):
         list_frames(tmp_path, '01')
     (tmp_path / 'sequences/08/velodyne/000000.bin').unlink()
-    with pytest.raises(DataError, match=r'no \.bin file'):
+    with pytest.raises(DataError, match=r'no velodyne/\*\.bin in it'):
         list_frames(tmp_path, '08')
 
 

@@ -34,7 +34,6 @@ ROS_PARAMETERS_KEY = 'ros__parameters'
 MAX_LENGTH = 1 << 18  # of a file: twenty times the largest of config/
 MAX_VALUES = 500  # of a file: five times those there are
 YAML_SUFFIXES = ('.yaml', '.yml')
-NO_VALUES = 'no parameters of the segmentation in it'
 FORM_OF_ROS = (
     'the node needs; from bare groups: gp-ground-seg config dump --config FILE > ros.yaml'
 )
@@ -256,7 +255,7 @@ class ParameterGroups:
         try:
             values = parameters_of(read_yaml(path))
             if not values:
-                LOGGER.warning('%s: %s', path, NO_VALUES)
+                LOGGER.warning('%s: no parameters of the segmentation in it', path)
             return (base or cls()).replace(**values)
         except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error
