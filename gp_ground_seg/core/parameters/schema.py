@@ -437,16 +437,14 @@ def nodes_of(document: object) -> list[tuple[str, dict[str, object]]]:
     names = dict.fromkeys(node for node, _ in ours if '*' not in node) or [ours[0][0]]
     nodes = []
     for name in names:
-        given: dict[str, Any] = {}
-        for node, values in ours:
-            given |= values if node == name or '*' in node else {}
-        nodes.append((name, given))
+        parts = [values for node, values in ours if node == name or '*' in node]
+        given = {key: value for part in parts for key, value in part.items()}
         if not isinstance(given.get('use_sim_time', False), bool):
             raise ConfigError(f'use_sim_time = {given["use_sim_time"]!r}: must be true or false')
-        if empty := [name for name, value in given.items() if value == []]:
+        if empty := [key for key, value in given.items() if value == []]:
             raise ConfigError(f'{empty[0]} = []: {EMPTY_LIST}')
-        for of_every_node in [name for name in given if name.startswith(OF_EVERY_NODE)]:
-            del given[of_every_node]
+        own = {key: given[key] for key in given if not key.startswith(OF_EVERY_NODE)}
+        nodes.append((name, own))
     return nodes
 
 
