@@ -61,15 +61,11 @@ def positive(word: str, least: int = 1) -> int:
 
 
 NUMBER: dict[str, Any] = {'metavar': 'N', 'type': positive}
-
-
 COLUMNS: tuple[str, str, dict[str, Any]] = (
     '--columns', f'numbers per point of a .bin scan, x y z first (default: {KITTI_COLUMNS})',
     {'metavar': 'N', 'type': partial(positive, least=MIN_COLUMNS)},
 )  # fmt: skip
 """Option of every command that reads ``.bin`` scans."""
-
-
 CLOUDS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
     COLUMNS,

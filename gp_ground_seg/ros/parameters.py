@@ -109,9 +109,8 @@ class ConfiguredNode(Node):  # type: ignore[misc]
                 start_parameter_services=False,
                 **options,
             )
-        given = self.get_parameters_by_prefix('')
-        for inherited in OF_EVERY_NODE:
-            given.pop(inherited, None)
+        every = self.get_parameters_by_prefix('').items()
+        given = {name: parameter for name, parameter in every if name not in OF_EVERY_NODE}
         # rclpy logs the error and goes on.
         use_sim_time = self.get_parameter('use_sim_time').value
         if not isinstance(use_sim_time, bool):
@@ -176,9 +175,8 @@ class ConfiguredNode(Node):  # type: ignore[misc]
             if config != self._config:
                 self.apply_config(config)
                 before, self._config = self._config, config
-                for name, value in config.flat().items():
-                    if value != before[name]:
-                        self.get_logger().info(f'{name}: {before[name]} -> {value}')
+                for spec, old, new in before.differences(config):
+                    self.get_logger().info(f'{spec.name}: {old} -> {new}')
         except Exception as error:
             reason = f'{type(error).__name__}: {error}'
             self.get_logger().error(f'parameters could not be applied: {reason}')

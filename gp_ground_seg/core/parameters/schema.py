@@ -70,15 +70,12 @@ class ParameterSpec:
             return 'true or false'
         if self.type is str:
             return 'a name'
-        unit = f' {self.unit}' if self.unit else ''
+        bounds = f'in [{self.minimum:g}, {self.maximum:g}] {self.unit}'.rstrip()
         if self.type is tuple:
-            return (
-                f'{NO_BOX} or six numbers in [{self.minimum:g}, {self.maximum:g}]{unit}, '
-                'in ascending pairs'
-            )
+            return f'{NO_BOX} or six numbers {bounds}, in ascending pairs'
         kind = 'an integer' if self.type is int else 'a number'
         auto = f'{AUTO} or ' if self.auto else ''
-        return f'{auto}{kind} in [{self.minimum:g}, {self.maximum:g}]{unit}'
+        return f'{auto}{kind} {bounds}'
 
     def check(self, value: object) -> ParameterValue:
         """Return `value` in the declared type; ConfigError if it is of another or out of range."""
