@@ -86,10 +86,10 @@ def to_scores_table() -> str:
     row = classes['vehicle']
     rows.append([f'vehicles lost, of {row["objects"]}', row['lost'], row['peer lost'], ''])
     row = rows_below(page, 'Low things and false cells')['all']
-    title = f'low objects: returns called ground, of {row["low returns"]}'
+    title = f'low objects: called ground, of {row["low returns"]}'
     rows.append([title, f'{row["as ground"]} %', f'{row["peer as ground"]} %', ''])
     row = classes['vegetation']
-    title = f'vegetation from 0.3 m up: returns called ground, of {row["returns"]}'
+    title = f'vegetation from 0.3 m: called ground, of {row["returns"]}'
     rows.append([title, f'{row["as ground"]} %', f'{row["peer as ground"]} %', ''])
     times = rows_below('docs/performance.md', 'Time per frame')
     ours, peer = times['learning'], times['Patchwork++']

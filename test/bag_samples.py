@@ -47,10 +47,10 @@ def string_message(text):
     return bytes(jazzy_types().serialize_cdr(message, 'std_msgs/msg/String'))
 
 
-def write_ros2_bag(path, n_clouds=3, topics=('/points',), storage=None, silent=(), **changes):
+def write_ros2_bag(path, n_clouds=3, topics=('/points',), silent=(), **changes):
     """Clouds on each topic, a string before every one of them; returns what was written."""
     written = []
-    with BagWriter(path, storage=storage) as bag:
+    with BagWriter(path) as bag:
         for topic in (*topics, *silent):
             bag.add_topic(topic)
         bag.add_topic('/note', 'std_msgs/msg/String')

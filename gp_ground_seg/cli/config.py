@@ -8,19 +8,14 @@ import sys
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import shown
 from gp_ground_seg.core.parameters.config import Config, find_preset, parameter_specs
-from gp_ground_seg.core.parameters.schema import (
-    FORM_OF_ROS,
-    NO_VALUES,
-    is_ours,
-    nodes_of,
-    read_yaml,
-)
+from gp_ground_seg.core.parameters.schema import FORM_OF_ROS, is_ours, nodes_of, read_yaml
 from gp_ground_seg.ros.arguments import objections_of_ros
 
 EXAMPLES = """\
   gp-ground-seg config dump > my.yaml            every parameter, explained, with its default
   gp-ground-seg config dump --config my.yaml --set label.ground_tolerance=0.15
   gp-ground-seg config dump --preset paper       those of the paper, with the reasons
+  gp-ground-seg config check my.yaml             unknown names, types, ranges
 """
 DUMP = 'print the effective parameters as a ROS parameter file'
 CHECK = 'say everything that is wrong with a parameter file'
@@ -29,20 +24,17 @@ Check names, types, ranges and the rules between parameters, and say who reads t
 file: commands read bare groups too, the node only the form of ROS (/**:
 ros__parameters:). Exit code 2 if anything is wrong.
 """
-CHECK_EXAMPLES = """\
-  gp-ground-seg config check my.yaml             unknown names, types, ranges
-"""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and its subcommands."""
     description = 'Show the parameters, their units and ranges.'
-    parser = options.new_parser(subparsers, 'config', description, EXAMPLES + CHECK_EXAMPLES)
+    parser = options.new_parser(subparsers, 'config', description, EXAMPLES)
     commands = parser.add_subparsers(metavar='WHAT', required=True)
     parser = options.new_parser(commands, 'dump', DUMP, EXAMPLES, DUMP)
     options.add_config(parser)
     parser.set_defaults(run=run_dump)
-    parser = options.new_parser(commands, 'check', CHECK_DESCRIPTION, CHECK_EXAMPLES, CHECK)
+    parser = options.new_parser(commands, 'check', CHECK_DESCRIPTION, EXAMPLES, CHECK)
     parser.add_argument('files', metavar='FILE', nargs='+', help='parameter file (YAML)')
     parser.set_defaults(run=run_check)
 
@@ -66,13 +58,10 @@ def run_check(arguments: argparse.Namespace) -> int:
             code = 2
             print(shown(f'{path}: {problem}'), file=sys.stderr)
         for node, values in [] if problems else nodes:
-            if not values:
-                options.note(f'{path}: {NO_VALUES}')
             n_changed = len(Config().differences(Config().replace(**values)))
             given = f'{len(values)} of {len(parameter_specs())} parameters given'
             use = '' if node else f' for --config, but not in the form of ROS that {FORM_OF_ROS}'
             if '/' in node.strip('/') or not is_ours(node):
                 use = f' for a node named {shown(node)} only'
-            differ = 'differs' if n_changed == 1 else 'differ'
-            print(f'{shown(path)}: good{use}; {given}, {n_changed} {differ} from the defaults')
+            print(f'{shown(path)}: good{use}; {given}, {n_changed} unlike the default')
     return code

@@ -9,13 +9,13 @@ rosbags for single MCAP files: a channel of protobuf or JSON, or no profile, sto
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack
-from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,8 +29,7 @@ from gp_ground_seg.data.point_cloud2 import DATATYPES, CloudMessage
 
 POINT_CLOUD2 = 'sensor_msgs/msg/PointCloud2'
 METADATA_FILE = 'metadata.yaml'
-SUFFIX_OF_STORAGE = {'mcap': '.mcap', 'sqlite3': '.db3'}
-STORAGE_OF_SUFFIX = {suffix: storage for storage, suffix in SUFFIX_OF_STORAGE.items()}
+STORAGE_OF_SUFFIX = {'.mcap': 'mcap', '.db3': 'sqlite3'}
 BAG_SUFFIXES = ('.bag', *STORAGE_OF_SUFFIX)
 
 _FOLDER_SUFFIXES = ('.mcap', '.db3', '.db3-shm', '.db3-wal', '.zstd', '.zst')
@@ -94,22 +93,6 @@ def check_sqlite_file(path: Path) -> None:
         if journal.exists() and journal.stat().st_size > 0:
             hint = f'`sqlite3 {path.name} vacuum` completes it'
             raise DataError(f'{path}: was not closed, some of it is in {journal.name}; {hint}')
-
-
-def resolve_storage(path: str | Path, wanted: str | None = None) -> str:
-    """Storage of a new bag: `wanted`, or by its suffix; DataError if the two contradict."""
-    suffix = Path(path).suffix
-    if suffix == '.bag':
-        raise DataError(f'{path}: only ROS 2 bags are written; use .mcap, .db3 or a folder name')
-    implied = STORAGE_OF_SUFFIX.get(suffix)
-    storage = wanted or implied or 'mcap'
-    if implied not in (None, storage):
-        raise DataError(
-            f'{path}: ends in {suffix}, which is not {storage} ({SUFFIX_OF_STORAGE[storage]})'
-        )
-    if storage == 'sqlite3':
-        check_sqlite_path(Path(path))
-    return storage
 
 
 @functools.cache
@@ -181,11 +164,11 @@ def _open_mcap(path: Path, stack: ExitStack) -> _Contents:
             if channel.message_encoding == 'cdr':
                 yield channel.topic, message.log_time, message.data
 
-    found = []
-    for c in channels.values():
-        msgtype = schemas[c.schema_id].name if c.schema_id else 'no type'
-        found.append(_Channel(c.topic, msgtype, c.message_encoding, counts.get(c.id, 0)))
-    return found, read
+    kinds = {0: 'no type', **{number: schema.name for number, schema in schemas.items() if number}}
+    return [
+        _Channel(c.topic, kinds[c.schema_id], c.message_encoding, counts.get(c.id, 0))
+        for c in channels.values()
+    ], read
 
 
 class BagReader(AbstractContextManager['BagReader']):
@@ -199,20 +182,18 @@ class BagReader(AbstractContextManager['BagReader']):
     ----------
     topics : dict of str to str
         Type of the messages of each topic; those not in CDR with their encoding.
-    storage : str
-        ``ros1``, ``mcap`` or ``sqlite3``.
     """
 
     def __init__(self, path: str | Path) -> None:
         require('rosbags.highlevel', 'rosbags mcap')
         self.path = Path(path)
-        self.storage = storage_of(self.path)
+        storage = storage_of(self.path)
         with ExitStack() as stack:
             with self._naming():
                 if self.path.suffix == '.mcap' and self.path.is_file():
                     channels, self._read = _open_mcap(self.path, stack)
                 else:
-                    channels, self._read = _open_ros(self.path, self.storage, stack)
+                    channels, self._read = _open_ros(self.path, storage, stack)
             self._open = stack.pop_all()
         self.topics: dict[str, str] = {}
         self._counts: dict[str, int] = {}
@@ -245,15 +226,8 @@ class BagReader(AbstractContextManager['BagReader']):
 
     def pick_point_cloud_topic(self, topic: str | None = None) -> str:
         """Return `topic` if it has point clouds, or the only one that has; else a DataError."""
-        clouds = [name for name, kind in self.topics.items() if kind == POINT_CLOUD2]
-        if topic is not None:
-            self.n_messages(topic)
-            if topic not in clouds:
-                raise DataError(
-                    f'{self.path}: topic {topic} is of type {self.topics[topic]}, must be '
-                    f'{POINT_CLOUD2}; such topics here: {", ".join(clouds) or "none"}'
-                )
-            clouds = [topic]
+        wanted = [topic] if topic else self.topics
+        clouds = [name for name in wanted if self.topics.get(name) == POINT_CLOUD2]
         recorded = [name for name in clouds if self.n_messages(name)]
         if len(recorded) == 1:
             return recorded[0]
@@ -263,7 +237,8 @@ class BagReader(AbstractContextManager['BagReader']):
         elif clouds:
             problem = f'no message on {", ".join(clouds)}'
         else:
-            problem = f'no {POINT_CLOUD2} topic; topics here: {self._list_topics()}'
+            named = f' {topic}' if topic else ''
+            problem = f'no {POINT_CLOUD2} topic{named}; topics here: {self._list_topics()}'
         raise DataError(f'{self.path}: {problem}')
 
     def messages(self, topics: Collection[str] | None = None) -> _Messages:
@@ -296,17 +271,18 @@ class BagReader(AbstractContextManager['BagReader']):
 class BagWriter:
     """A new rosbag2 bag, in a ``with`` statement; written whole or not at all (`staged_file`).
 
-    `path` is a folder as ``ros2 bag record -o`` makes, or a single file, by its suffix; `storage`
-    see `resolve_storage`. With `force` a bag of that name is replaced. Raises DataError if the
-    path is taken or cannot be written, MissingDependencyError without rosbags.
+    `path` is a folder as ``ros2 bag record -o`` makes, stored as MCAP, or a single file, by its
+    suffix. With `force` a bag of that name is replaced. Raises DataError if the path is taken or
+    cannot be written, MissingDependencyError without rosbags.
     """
 
-    def __init__(
-        self, path: str | Path, *, storage: str | None = None, force: bool = False
-    ) -> None:
+    def __init__(self, path: str | Path, *, force: bool = False) -> None:
         require('rosbags.highlevel', 'rosbags')
         self.path = Path(path)
-        self.storage = resolve_storage(path, storage)
+        if self.path.suffix == '.bag':
+            raise DataError(f'{path}: only ROS 2 bags are written; use .mcap, .db3 or a folder')
+        if self.path.suffix == '.db3':
+            check_sqlite_path(self.path)
         self._force = force
         self._connections: dict[str, Any] = {}
 
@@ -319,14 +295,14 @@ class BagWriter:
                 product = stack.enter_context(staged_file(self.path, force=self._force))
                 # rosbags writes folders; the one file in it is named after the folder.
                 folder = product.parent / 'bag' / product.stem
-                file = folder / f'{folder.name}{SUFFIX_OF_STORAGE[self.storage]}'
+                file = folder / f'{folder.name}{self.path.suffix}'
                 stack.push(lambda kind, *_: os.rename(file, product) if kind is None else None)
             else:
                 folder = stack.enter_context(
                     staged_file(self.path, force=self._force, is_kind=is_bag_folder)
                 )
             stack.enter_context(writing(self.path))
-            plugin = StoragePlugin[self.storage.upper()]
+            plugin = StoragePlugin[STORAGE_OF_SUFFIX.get(self.path.suffix, 'mcap').upper()]
             # Version 9 is what Jazzy writes.
             self._writer = stack.enter_context(Writer(folder, version=9, storage_plugin=plugin))
             self._open = stack.pop_all()
@@ -359,9 +335,8 @@ def stamp_of(cloud: CloudMessage) -> tuple[int, int]:
 
 def with_stamp(cloud: CloudMessage, stamp: tuple[int, int]) -> CloudMessage:
     """Copy of a message with another stamp, in s and ns; the points are shared."""
-    moved = copy(cloud)
-    moved.header = _new_header(stamp, cloud.header.frame_id)
-    return moved
+    header = _new_header(stamp, cloud.header.frame_id)
+    return dataclasses.replace(cloud, header=header)  # type: ignore[type-var]
 
 
 def cloud_from_columns(

@@ -69,10 +69,9 @@ def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
     if coordinate_names(arrays)[0] not in arrays:
         table = arrays.pop(_table_of(arrays))
         arrays = {**scatter(_points_of(table)), **arrays}
-    x = arrays.get(coordinate_names(arrays)[0], np.empty(()))
-    fields = {name: v for name, v in arrays.items() if x.ndim and v.shape[:1] == x.shape}
-    if not fields:
-        raise PointCloudError(f'no field x of one number per point; fields: {_shapes(arrays)}')
+    first = next(iter(arrays.values()))
+    x = arrays.get(coordinate_names(arrays)[0], first)
+    fields = {name: v for name, v in arrays.items() if v.shape[:1] == x.shape[:1]}
     return gather(fields), {name: v for name, v in arrays.items() if name not in fields}
 
 
@@ -240,12 +239,12 @@ def find_columns(numbers: npt.NDArray[np.float32], columns: int) -> int:
 
 def _information(classes: npt.NDArray[np.intp], n: int) -> float:
     """Mutual information [nat] of the column and the class of numbers in `n` columns."""
+    from scipy.special import entr
+
     rows = classes[: len(classes) // n * n].reshape(-1, n)
     counts = np.array([np.bincount(column, minlength=_N_CLASSES) for column in rows.T])
     share = counts / counts.sum()
-    alone = np.outer(share.sum(axis=1), share.sum(axis=0))
-    seen = share > 0.0
-    return float((share[seen] * np.log(share[seen] / alone[seen])).sum())
+    return float(np.log(n) + entr(share.sum(axis=0)).sum() - entr(share).sum())
 
 
 def four_columns(table: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:

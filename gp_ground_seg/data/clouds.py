@@ -135,8 +135,7 @@ def in_types(
     it holds them exactly; where `flat`, a field ``a`` of several numbers becomes fields ``a_0``,
     ``a_1``, ... Names stay `distinct`. Raises PointCloudError for a type that is not `accepted`.
     """
-    names: list[str] = []
-    columns: list[npt.NDArray[Any]] = []
+    columns: list[tuple[str, npt.NDArray[Any]]] = []
     for name, values in scatter(fields).items():
         code = values.dtype.str[1:]
         code = {'b1': 'u1', 'f2': 'f4'}.get(code, code)
@@ -147,12 +146,13 @@ def in_types(
         values = values.astype(f'<{code}')
         word = '_'.join(name.split())
         word = 'field' if word in ('', '_') else word  # _ is the padding of a PCD
-        parts = [values]
-        if is_split := flat and values.ndim > 1:
-            parts = list(values.reshape(len(values), math.prod(values.shape[1:])).T)
-        names += [f'{word}_{k}' if is_split else word for k in range(len(parts))]
+        parts = [(word, values)]
+        if flat and values.ndim > 1:
+            table = values.reshape(len(values), math.prod(values.shape[1:])).T
+            parts = [(f'{word}_{k}', part) for k, part in enumerate(table)]
         columns += parts
-    return gather(dict(zip(distinct(names), columns, strict=True)))
+    names, arrays = zip(*columns, strict=True)
+    return gather(dict(zip(distinct(names), arrays, strict=True)))
 
 
 def split_header(data: bytes, last: str) -> tuple[list[str], bytes]:

@@ -82,6 +82,12 @@ def writing(path: str | Path) -> Iterator[None]:
         raise DataError(f'{path}: cannot be written: {reason_of(error)}') from error
 
 
+def check_writable(target: str | Path, *, force: bool) -> None:
+    """Raise what `staged_file` would, for a file that is written later."""
+    with staged_file(target, force=force):
+        pass
+
+
 @contextmanager
 def _opened(path: str | Path) -> Iterator[int]:
     """Open a file or folder to read it; yield its number."""
@@ -123,40 +129,28 @@ def write_file(path: Path, data: bytes) -> None:
     """
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    with _staged(path, force=True) as part, writing(path):
+    with staged_file(path, force=True, tidies=False) as part, writing(path):
         part.write_bytes(data)
 
 
 @contextmanager
 def staged_file(
-    target: str | Path, *, force: bool, is_kind: Callable[[Path], bool] = Path.is_file
+    target: str | Path,
+    *,
+    force: bool,
+    is_kind: Callable[[Path], bool] = Path.is_file,
+    tidies: bool = True,
 ) -> Iterator[Path]:
     """Yield a path to write; at the end of the block the file is renamed to `target`.
 
     Raises DataError if the target exists and `force` is false, is not of the kind that may be
     replaced, or cannot be written. A block that writes nothing changes nothing.
-    """
-    path = Path(target).resolve()
-    remove_leftovers(path.parent, path.name)
-    with _staged(target, force=force, is_kind=is_kind) as product:
-        yield product
-
-
-def check_writable(target: str | Path, *, force: bool) -> None:
-    """Raise what `staged_file` would, for a file that is written later."""
-    with staged_file(target, force=force):
-        pass
-
-
-@contextmanager
-def _staged(
-    target: str | Path, *, force: bool, is_kind: Callable[[Path], bool] = Path.is_file
-) -> Iterator[Path]:
-    """Path with the final name, in a hidden folder beside it that goes away in the end.
-
-    The folder is locked. One of a run that was killed is not: the next run removes it.
+    The path has the final name, in a hidden folder beside it that goes away in the end. The folder
+    is locked. One of a run that was killed is not: the next run that `tidies` removes it.
     """
     path, check = Path(target).resolve(), partial(_check, target, force, is_kind)
+    if tidies:
+        remove_leftovers(path.parent, path.name)
     if path.is_symlink():
         raise DataError(f'{target}: {os.strerror(errno.ELOOP)}')
     check(path)

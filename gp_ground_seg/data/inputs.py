@@ -106,11 +106,11 @@ def list_inputs(
         raise DataError(f'--topic: is for bags, which {source} is not')
     files = _find_files(path)
     stems = Counter(map(_stem, files))
-    items = []
-    for file in files:
-        name = _stem(file) if stems[_stem(file)] == 1 else file.name
-        items.append(Input(name, shown(file.name), file, partial(read_file, file, columns)))
-    return Inputs(path, items)
+    names = (_stem(file) if stems[_stem(file)] == 1 else file.name for file in files)
+    return Inputs(path, [
+        Input(name, shown(file.name), file, partial(read_file, file, columns))
+        for name, file in zip(names, files, strict=True)
+    ])  # fmt: skip
 
 
 def holds_bag(path: Path) -> bool:

@@ -29,7 +29,6 @@ from gp_ground_seg.data.clouds import (
 )
 
 _MAX_EXPANSION = 88  # of LZF: three bytes repeat 264 at most
-_MAX_BYTES = 1 << 16  # of a point
 _MAX_NUMBER = 1 << 32  # in a header
 _PADDING = ' '  # no name of a header has a space
 _SHAPE = ('WIDTH', 'HEIGHT', 'POINTS')
@@ -107,11 +106,8 @@ def _types_of(names: list[str], entries: dict[str, list[str]]) -> list[tuple[str
         if code not in _TYPES:
             raise PointCloudError(f'field {name}: no type {kind} of {size} bytes')
         types.append((f'{_PADDING}{name}' if given == '_' else name, f'<{code}', shape))
-    check_numbers(sum(math.prod(shape) for name, _, shape in types if _PADDING not in name))
-    # numpy adds them in 32 bits, and would read outside of the file.
-    n_bytes = sum(np.dtype(code).itemsize * math.prod(shape) for _, code, shape in types)
-    if n_bytes > _MAX_BYTES:
-        raise PointCloudError(f'{n_bytes} bytes per point, accepted are at most {_MAX_BYTES}')
+    # numpy adds their bytes in 32 bits, and would read outside of the file.
+    check_numbers(sum(math.prod(shape) for _, _, shape in types))
     return types
 
 

@@ -9,7 +9,8 @@ Source: http://paulbourke.net/dataformats/ply/.
 from __future__ import annotations
 
 import logging
-from typing import Any, Literal
+import re
+from typing import Any
 
 import numpy as np
 
@@ -32,12 +33,8 @@ _CODES = {
 _NAMES = {code: name for name, code in _CODES.items()}
 # int8, ..., of newer writers.
 _READABLE = {**_CODES, **{np.dtype(code).name: code for code in (*_NAMES, 'i8', 'u8')}}
-_ByteOrder = Literal['little', 'big']
-_ORDERS: dict[str, _ByteOrder] = {
-    'ascii': 'little',
-    'binary_little_endian': 'little',
-    'binary_big_endian': 'big',
-}
+_BIG = 'binary_big_endian'
+_FORMS = 'ascii', 'binary_little_endian', _BIG
 _ListSizes = list[tuple[int, int]]
 """Bytes of the count, and of an item, of each list of a vertex."""
 
@@ -53,29 +50,27 @@ def read_ply(data: bytes) -> tuple[Fields, list[str]]:
     entries = [line.split() for line in lines if line not in remarks]
     form = ' '.join(next((words[1:2] for words in entries if words[0] == 'format'), [])).lower()
     starts = [k for k, words in enumerate(entries) if words[0] == 'element']
-    elements = [' '.join(entries[k][1:]) for k in starts]
-    kind, _, count = elements[0].partition(' ') if elements else ('', '', '')
-    if lines[0].lower() != 'ply' or form not in _ORDERS or kind != 'vertex':
-        found = ', '.join(elements) or 'none'
+    elements = ', '.join(' '.join(entries[k][1:]) for k in starts)
+    vertices = re.match(r'vertex (\d+)(, |$)', elements, re.ASCII)
+    if lines[0].lower() != 'ply' or form not in _FORMS or vertices is None:
         raise PointCloudError(
-            f'no PLY with vertices as its first element: format {form}, elements {found}'
+            'no PLY with a number of vertices as its first element: '
+            f'format {form}, elements {elements or "none"}'
         )
-    if not count.isdecimal():
-        raise PointCloudError(f'element vertex {count}: must have a whole number')
-    n_points, order = int(count), _ORDERS[form]
+    n_points, is_big = int(vertices[1]), form == _BIG
     begin, end = [*starts, len(entries)][:2]
     properties = [words for words in entries[begin:end] if words[0] == 'property']
-    dtype, lists = _types_of(properties, order)
+    dtype, lists = _types_of(properties, is_big)
     if form == 'ascii':
         fields = read_lines(body, dtype, n_points)
     else:
         if lists:
-            body = _without_lists(body, dtype.itemsize, lists, order, n_points)
+            body = _without_lists(body, dtype.itemsize, lists, is_big, n_points)
         fields = read_table(body, dtype, n_points)
     return fields.astype(fields.dtype.newbyteorder('=')), remarks
 
 
-def _types_of(properties: list[list[str]], order: _ByteOrder) -> tuple[np.dtype[Any], _ListSizes]:
+def _types_of(properties: list[list[str]], is_big: bool) -> tuple[np.dtype[Any], _ListSizes]:
     """Type of the numbers of a vertex, and its lists, of the lines of its properties."""
     names, codes = [], []
     lists: dict[str, tuple[int, int]] = {}
@@ -91,7 +86,7 @@ def _types_of(properties: list[list[str]], order: _ByteOrder) -> tuple[np.dtype[
             raise PointCloudError(f'property {line[-1]} is behind a list: must be before it')
         else:
             names.append(line[-1])
-            codes.append(f'{"<" if order == "little" else ">"}{found[0]}')
+            codes.append(f'{">" if is_big else "<"}{found[0]}')
     if lists:
         log_once(logging.INFO, f'PLY: lists of the vertices are left out: {", ".join(lists)}')
     dtype = np.dtype(list(zip(distinct(names), codes, strict=True)))
@@ -99,7 +94,7 @@ def _types_of(properties: list[list[str]], order: _ByteOrder) -> tuple[np.dtype[
 
 
 def _without_lists(
-    data: bytes, n_bytes: int, lists: _ListSizes, order: _ByteOrder, n_points: int
+    data: bytes, n_bytes: int, lists: _ListSizes, is_big: bool, n_points: int
 ) -> bytes:
     """Rows of a body, each cut to its first `n_bytes`."""
     check_size(len(data), n_points, n_points * (n_bytes + sum(count for count, _ in lists)))
@@ -108,7 +103,7 @@ def _without_lists(
         rows.append(data[place : place + n_bytes])
         place += n_bytes
         for count, item in lists:
-            n_items = int.from_bytes(data[place : place + count], order)
+            n_items = int.from_bytes(data[place : place + count], 'big' if is_big else 'little')
             place += count + item * n_items
     check_size(len(data), n_points, place)
     return b''.join(rows)

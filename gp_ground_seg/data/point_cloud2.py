@@ -123,17 +123,14 @@ def append_columns(
         placed.append((name, start, DATATYPES[f'{values.dtype.kind}{itemsize}']))
         end = start + itemsize
     step = _round_up(end, _ALIGNMENT)
-    height, width = cloud.height, cloud.width
-    size = height * width
-    wide = np.zeros(size * step, dtype=np.uint8)
-    if size:
-        points = _view(cloud, f'V{cloud.point_step}')
-        np.ndarray((height, width), points.dtype, wide.data, 0, (width * step, step))[...] = points
-        with np.errstate(over='ignore', invalid='ignore'):
-            for name, offset, datatype in placed:
-                code = _code(cloud, datatype)
-                np.ndarray((size,), code, wide.data, offset, (step,))[...] = columns[name]
-    return placed, step, wide
+    points = _view(cloud, f'V{cloud.point_step}')
+    wide = np.zeros((points.size, step), dtype=np.uint8)
+    wide[:, : cloud.point_step].view(points.dtype)[:, 0] = points.reshape(-1)
+    with np.errstate(over='ignore', invalid='ignore'):
+        for name, start, datatype in placed:
+            column = wide[:, start : start + columns[name].itemsize].view(_code(cloud, datatype))
+            column[:, 0] = columns[name]
+    return placed, step, wide.reshape(-1)
 
 
 def _round_up(value: int, multiple: int) -> int:
@@ -169,19 +166,16 @@ def _views(
 
 def _check_field(field: Any, accepted: Collection[int], point_step: int) -> None:
     """Raise PointCloudError unless a field is of an accepted type and within the point."""
-    problem = ''
+    what = f'point cloud: field {field.name}'
     if field.datatype not in accepted:
         kind = _DATATYPE_NAMES.get(field.datatype, 'unknown')
         wanted = ' or '.join(f'{_DATATYPE_NAMES[datatype]} ({datatype})' for datatype in accepted)
-        problem = f'has datatype {field.datatype} ({kind}): must be {wanted}'
-    else:
-        n_bytes = max(field.count, 1) * int(_CODES[field.datatype][1])
-        # numpy adds in 32 bits, and would read outside of the data.
-        if not 0 <= field.offset <= point_step - n_bytes:
-            place = f'at offset {field.offset} of {n_bytes} bytes'
-            problem = f'{place}: must end within point_step {point_step}'
-    if problem:
-        raise PointCloudError(f'point cloud: field {field.name} {problem}')
+        raise PointCloudError(f'{what} has datatype {field.datatype} ({kind}): must be {wanted}')
+    n_bytes = max(field.count, 1) * int(_CODES[field.datatype][1])
+    # numpy adds in 32 bits, and would read outside of the data.
+    if not 0 <= field.offset <= point_step - n_bytes:
+        place = f'at offset {field.offset} of {n_bytes} bytes'
+        raise PointCloudError(f'{what} {place}: must end within point_step {point_step}')
 
 
 def _view(cloud: CloudMessage, code: npt.DTypeLike, offset: int = 0) -> npt.NDArray[Any]:
@@ -192,19 +186,16 @@ def _view(cloud: CloudMessage, code: npt.DTypeLike, offset: int = 0) -> npt.NDAr
         return np.empty((height, width), code)
     needed = (height - 1) * row_step + row_bytes
     raw = np.frombuffer(cloud.data, dtype=np.uint8)
-    problem = ''
-    if point_step < 1:
-        problem = f'point_step {point_step}: must be at least 1 byte'
-    elif height > 1 and row_step < row_bytes:
-        problem = f'row_step {row_step}: must be at least {row_bytes} '
-        problem += f'(width {width} * point_step {point_step})'
-    elif len(raw) < needed:
-        layout = f'height {height}, width {width}, point_step {point_step}, row_step {row_step}'
-        problem = f'data of {len(raw)} bytes: must be at least {needed} ({layout})'
-    elif row_step > len(raw):
-        problem = f'row_step {row_step}: must be at most the {len(raw)} bytes of data'
-    if problem:
-        raise PointCloudError(f'point cloud: {problem}')
+    rules = (
+        (f'point_step {point_step}', point_step >= 1, 'at least 1 byte'),
+        (f'row_step {row_step}', height == 1 or row_step >= row_bytes, f'at least {row_bytes}'),
+        (f'data of {len(raw)} bytes', len(raw) >= needed, f'at least {needed}'),
+        (f'row_step {row_step}', row_step <= len(raw), f'at most the {len(raw)} bytes of data'),
+    )
+    layout = f'height {height}, width {width}, point_step {point_step}, row_step {row_step}'
+    for what, holds, bound in rules:
+        if not holds:
+            raise PointCloudError(f'point cloud: {what}: must be {bound} ({layout})')
     view: npt.NDArray[Any] = np.ndarray((height, width), code, raw, offset, (row_step, point_step))
     return view
 

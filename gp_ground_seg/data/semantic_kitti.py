@@ -90,17 +90,16 @@ def list_sequences(root: str | Path) -> list[str]:
 def list_frames(root: str | Path, sequence: str, columns: int = KITTI_COLUMNS) -> list[Frame]:
     """Frames of one sequence, in order; DataError if there are none, or times.txt does not fit."""
     folder = Path(root, 'sequences', sequence)
-    if not (folder / 'velodyne').is_dir():
-        known = ', '.join(list_sequences(root))
-        raise DataError(f'{folder}: no velodyne folder in it; sequences here: {known}')
-    paths = sorted((folder / 'velodyne').glob('*.bin'))
+    paths = sorted(folder.glob('velodyne/*.bin'))
     if not paths:
-        raise DataError(f'{folder / "velodyne"}: no .bin file in it')
+        known = ', '.join(list_sequences(root))
+        raise DataError(f'{folder}: no velodyne/*.bin in it; sequences here: {known}')
     labels = {path.stem: path for path in (folder / 'labels').glob('*.label')}
-    frames = []
-    for path, time in zip(paths, _read_times(folder / 'times.txt', paths), strict=True):
-        frames.append(Frame(sequence, path.stem, path, labels.get(path.stem), time, columns))
-    return frames
+    pairs = zip(paths, _read_times(folder / 'times.txt', paths), strict=True)
+    return [
+        Frame(sequence, path.stem, path, labels.get(path.stem), time, columns)
+        for path, time in pairs
+    ]
 
 
 def labelled_frames(

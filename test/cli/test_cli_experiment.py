@@ -65,7 +65,7 @@ def test_tables_and_the_rows_below_them(case, root, tmp_path, capsys, monkeypatc
 REFUSED = {
     'experiment ablation ROOT --seeds 2': '--seeds: is for simulated scans',
     'experiment ablation --frame-step 2': '--frame-step: is for labelled scans',
-    'experiment ablation ROOT --sequences 07': 'no velodyne folder in it; sequences here: 00, 08',
+    'experiment ablation ROOT --sequences 07': 'no velodyne/*.bin in it; sequences here: 00, 08',
     'experiment ablation --set length_scale.model=latent2': 'length_scale.model',
     'experiment scenes --scenes flat,flat': 'each once',
     'experiment table1': 'ROOT',

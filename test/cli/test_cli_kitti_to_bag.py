@@ -10,7 +10,7 @@ import pytest
 from evaluation_samples import write_frame
 
 from gp_ground_seg.cli.bags import EPOCH
-from gp_ground_seg.data.bags import POINT_CLOUD2, BagReader, decode_cloud, stamp_of
+from gp_ground_seg.data.bags import POINT_CLOUD2, BagReader, decode_cloud, stamp_of, storage_of
 
 TOPIC = '/kitti/velo/pointcloud'
 TIMES = [0.0, 0.1036219, 0.2072, 0.311, 0.415]
@@ -50,8 +50,7 @@ def test_sequence_as_bag(tmp_path, capsys, name, storage, times):
         f'5 frames (4 with labels), 9 005 points, 0.4 s, written to {out}\n', '',
     )  # fmt: skip
     assert out.is_file() == ('.' in name)
-    with BagReader(out) as bag:
-        assert bag.storage == storage
+    assert storage_of(out) == storage
     clouds = read_clouds(out)
     assert len(clouds) == 5
     for k, (recorded, cloud) in enumerate(clouds):

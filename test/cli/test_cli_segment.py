@@ -18,7 +18,7 @@ from gp_ground_seg.cli.segment import _pose_summary
 from gp_ground_seg.core.errors import in_thousands
 from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
-from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud
+from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud, storage_of
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 
@@ -94,7 +94,7 @@ def assert_splits(source, result, topic, segmenter):
         ('drive.mcap', '', 'drive_ground.mcap', 'mcap'),
         ('drive.db3', '', 'drive_ground.db3', 'sqlite3'),
         ('drive.bag', '', 'drive_ground', 'mcap'),
-        ('drive.db3', '-o out', 'out', 'sqlite3'),
+        ('drive.db3', '-o out', 'out', 'mcap'),
         ('drive.db3', '-o out.mcap', 'out.mcap', 'mcap'),
         ('two.mcap', '--topic /front', 'two_ground.mcap', 'mcap'),
         ('two.mcap', '--topic /ground', 'two_ground.mcap', 'mcap'),
@@ -116,8 +116,7 @@ def test_bag_gets_ground_and_obstacles(
     assert hidden(tmp_path) == []
     topic = words.split()[-1] if '--topic' in words else topics.get(name, ['/points'])[0]
     assert assert_splits(source, tmp_path / out, topic, segmenter) == 3
-    with BagReader(tmp_path / out) as bag:
-        assert bag.storage == storage
+    assert storage_of(tmp_path / out) == storage
 
 
 def test_empty_and_all_nan_clouds_give_empty_clouds(tmp_path):

@@ -14,7 +14,7 @@ from gp_ground_seg.cli import main as cli
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
-from gp_ground_seg.core.parameters.config import size_of_tables
+from gp_ground_seg.core.pipeline.polar_grid import bin_edges
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -55,7 +55,8 @@ def test_few_tiles_are_no_access_beyond_the_tables():
     ],
 )
 @pytest.mark.parametrize('make', [NumpyBackend, NumbaBackend])
-def test_memory_is_what_was_computed(values, make):
+def test_memory_is_that_of_tiles_and_cells(values, make):
+    """With the largest r_max, the smallest tiles and the most cells it is 1.3 GB."""
     config = Config().replace(**values)
     points = np.tile(hilly_scan(4096), (fewer(2, 1), 1))
     tracemalloc.start()
@@ -66,7 +67,9 @@ def test_memory_is_what_was_computed(values, make):
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert 0.4 * size_of_tables(config) < peak < 1.05 * size_of_tables(config)
+    n_tiles = (2.0 * config.grid.r_max / config.faces.cell_size) ** 2
+    n_bytes = 9 * n_tiles + 184 * config.grid.n_segments * (len(bin_edges(config.grid)) - 1)
+    assert 0.4 * n_bytes < peak < 1.05 * n_bytes
 
 
 def test_an_interrupt_is_130_whatever_compiled_code_makes_of_it(monkeypatch, capsys):

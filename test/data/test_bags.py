@@ -1,8 +1,6 @@
 """Bags: every kind in, rosbag2 out, whole or not at all."""
 
-import sqlite3
 import sys
-from functools import partial
 
 import bag_samples as samples
 import pytest
@@ -17,11 +15,10 @@ from gp_ground_seg.data.bags import (
     encode_cloud,
     is_bag_folder,
     jazzy_types,
-    resolve_storage,
 )
 from gp_ground_seg.data.inputs import holds_bag
 
-SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive.db3', None)]
+NAMES = 'drive', 'drive.mcap', 'drive.db3'
 
 
 def read_all(path):
@@ -33,10 +30,10 @@ def listing(folder):
     return sorted(path.name for path in folder.rglob('*'))
 
 
-@pytest.mark.parametrize(('name', 'storage'), SHAPES)
-def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
+@pytest.mark.parametrize('name', NAMES)
+def test_messages_come_back_bit_for_bit(tmp_path, name):
     path = tmp_path / name
-    written = samples.write_ros2_bag(path, storage=storage, silent=('/silent',))
+    written = samples.write_ros2_bag(path, silent=('/silent',))
     assert holds_bag(path)
     with BagReader(path) as bag:
         clouds = dict.fromkeys(('/points', '/silent'), POINT_CLOUD2)
@@ -46,12 +43,10 @@ def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
         assert bag.pick_point_cloud_topic() == '/points'
         with pytest.raises(DataError, match='no message on /silent'):
             bag.pick_point_cloud_topic('/silent')
-        assert bag.storage == resolve_storage(path, storage)
         assert list(bag.messages()) == written
         assert list(bag.messages(['/note'])) == written[::2]
     if path.is_dir():
-        suffix = '.mcap' if storage == 'mcap' else '.db3'
-        assert listing(path) == [f'drive{suffix}', 'metadata.yaml']
+        assert listing(path) == ['drive.mcap', 'metadata.yaml']
         assert is_bag_folder(path)
         assert 'partial' not in (path / 'metadata.yaml').read_text()
     # AnyReader compares the stored hash of each type with that of the stored definition.
@@ -69,7 +64,6 @@ def test_clouds_of_ros1(tmp_path):
     samples.write_ros1_bag(path)
     path.write_bytes(path.read_bytes().replace(b'float64 value', b'float64 **** '))
     with BagReader(path) as bag:
-        assert bag.storage == 'ros1'
         topic = bag.pick_point_cloud_topic()
         assert list(bag.messages([topic])) == [
             (topic, samples.START + k * samples.PERIOD, encode_cloud(samples.cloud(k)))
@@ -81,26 +75,22 @@ def test_clouds_of_ros1(tmp_path):
 
 def test_the_topic_is_chosen_and_what_a_folder_lacks_is_noticed(tmp_path):
     path = tmp_path / 'two'
-    samples.write_ros2_bag(path, topics=('/front', '/rear'), storage='sqlite3')
+    samples.write_ros2_bag(path, topics=('/front', '/rear'))
     with BagReader(path) as bag:
         with pytest.raises(DataError, match='choose one with --topic: /front, /rear'):
             bag.pick_point_cloud_topic()
         assert bag.pick_point_cloud_topic('/rear') == '/rear'
         with pytest.raises(DataError, match=r'no topic /left; topics here: /front \('):
             list(bag.messages(['/left']))
-        with pytest.raises(DataError, match=r'/note is of type std_msgs/msg/String, must be'):
+        with pytest.raises(DataError, match=r'topic /note; .*, /note \(std_msgs/msg/String\)'):
             bag.pick_point_cloud_topic('/note')
-    with sqlite3.connect(path / 'two.db3') as connection:
-        connection.execute('DELETE FROM messages WHERE id = 5')
-    connection.close()
-    with pytest.raises(DataError, match='topic /front lists 3 messages, 2 could be read'):
-        read_all(path)
-    (path / 'two.db3-wal').write_bytes(b'left by a crash')
-    with pytest.raises(DataError, match=r'was not closed, some of it is in two\.db3-wal'):
-        read_all(path)
     (path / 'metadata.yaml').unlink()
-    with pytest.raises(DataError, match=r'no metadata\.yaml in it\).*one by one: two\.db3$'):
+    with pytest.raises(DataError, match=r'no metadata\.yaml in it\).*one by one: two\.mcap$'):
         read_all(path)
+    samples.write_ros2_bag(tmp_path / 'a.db3')
+    (tmp_path / 'a.db3-wal').write_bytes(b'left by a crash')
+    with pytest.raises(DataError, match=r'was not closed, some of it is in a\.db3-wal'):
+        read_all(tmp_path / 'a.db3')
 
 
 def test_errors_of_the_caller_pass_unchanged(tmp_path):
@@ -133,8 +123,6 @@ def test_impossible_paths_are_refused(tmp_path):
     samples.write_ros2_bag(tmp_path / 'a.db3')
     (tmp_path / 'a.db3').rename(tmp_path / 'a#2?.db3')
     for make, name, message in (
-        (partial(BagWriter, storage='mcap'), 'a.db3', r'ends in \.db3, which is not mcap'),
-        (partial(BagWriter, storage='sqlite3'), 'a#1', 'sqlite3 bag cannot have # in its path'),
         (BagWriter, '100%.db3', 'sqlite3 bag cannot have % in its path'),
         (BagReader, 'a#2?.db3', r'sqlite3 bag cannot have # \? in its path'),
     ):

@@ -49,7 +49,7 @@ def test_sequences_and_frames_are_sorted_and_need_scans(tmp_path):
     assert all(frame.sequence == '00' for frame in frames)
     assert frames[0].points_path.read_bytes() == points.tobytes()
     (tmp_path / 'sequences/08/velodyne/000000.bin').unlink()
-    with pytest.raises(DataError, match=r'no \.bin file'):
+    with pytest.raises(DataError, match=r'no velodyne/\*\.bin in it'):
         list_frames(tmp_path, '08')
 
 

@@ -112,4 +112,4 @@ def test_what_is_missing_or_older_than_its_input_is_done_again(segmented, tmp_pa
     assert label_files(out) != known and label_files(out).keys() == known.keys()
     assert (out / 'readme').read_text() == 'mine'
     assert run('config', 'check', out / PARAMETERS) == 0
-    assert '1 differs from the defaults' in capsys.readouterr().out
+    assert '1 unlike the default' in capsys.readouterr().out

@@ -229,7 +229,7 @@ class SurfaceConfig(ParameterGroup):
 class FacesConfig(ParameterGroup):
     """Vertical faces, whose bases lie within the tolerance of ground."""
 
-    cell_size: float = advanced(0.5, (0.05, 10.0),
+    cell_size: float = advanced(0.5, (0.1, 10.0),
         'side of the square tiles whose returns are judged together', 'm')
     max_normal_z: float = advanced(0.45, (0.0, 1.0),
         'vertical part of the unit normal below which a tile is a vertical face; 0 = none is')
@@ -308,8 +308,6 @@ _ASCENDING = (
 """Pairs of which the first must be below the second."""
 NARROWEST_BIN = 1e-3
 """Least width of a bin [m]: no sensor measures ranges as finely, single precision does."""
-MAX_TABLES = 2e9
-"""Most memory that the tables of tiles and cells may take [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -340,7 +338,7 @@ class Config(ParameterGroups):
             low, high = float(self[lower]), float(self[upper])
             if not low < high:
                 raise ConfigError(f'{lower} = {low:g}: must be below {upper} = {high:g}')
-        grid, size = self.grid, size_of_tables(self)
+        grid = self.grid
         # Bins widen with range: the first one is the narrowest.
         width = grid.first_width
         if width < NARROWEST_BIN:
@@ -349,25 +347,11 @@ class Config(ParameterGroups):
                 f'grid.r_min = {grid.r_min:g} and grid.r_max = {grid.r_max:g}: the first bin '
                 f'would be {width:.2g} m wide; must be at least {NARROWEST_BIN:g} m'
             )
-        if size > MAX_TABLES:
-            raise ConfigError(
-                f'grid.r_max = {grid.r_max:g}, faces.cell_size = {self.faces.cell_size:g}: '
-                f'tables of tiles and cells would take {size / 1e9:.1f} GB; must be at most '
-                f'{MAX_TABLES / 1e9:g} GB'
-            )
 
     @classmethod
     def preset(cls, name: str) -> Config:
         """Return the preset `name`, ``default`` or ``paper``; ConfigError for another."""
         return find_preset(name).config
-
-
-def size_of_tables(config: Config) -> int:
-    """Memory that tables of tiles and cells take, of points of double precision [bytes]."""
-    n_tiles = math.ceil(2.0 * config.grid.r_max / config.faces.cell_size) ** 2
-    n_cells = config.grid.n_segments * (config.grid.n_bins + config.grid.n_near)
-    # Held against both backends by test_robustness.py.
-    return 9 * n_tiles + 184 * n_cells
 
 
 def parameter_specs() -> tuple[ParameterSpec, ...]:

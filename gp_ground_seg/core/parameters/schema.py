@@ -6,11 +6,10 @@ import contextlib
 import dataclasses
 import difflib
 import functools
-import math
 import numbers
 import re
 import textwrap
-from collections import namedtuple
+from collections import Counter, namedtuple
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,10 +31,9 @@ NO_BOX: Literal['none'] = 'none'
 ROS_NODE_KEY = '/**'
 NODE_NAME = 'ground_segmentation_node'
 ROS_PARAMETERS_KEY = 'ros__parameters'
-MAX_FILE_BYTES = 1 << 18  # twenty times the largest of config/
+MAX_LENGTH = 1 << 18  # of a file: twenty times the largest of config/
 MAX_VALUES = 500  # of a file: five times those there are
 YAML_SUFFIXES = ('.yaml', '.yml')
-NO_VALUES = 'no parameters of the segmentation in it'
 FORM_OF_ROS = (
     'the node needs; from bare groups: gp-ground-seg config dump --config FILE > ros.yaml'
 )
@@ -72,15 +70,12 @@ class ParameterSpec:
             return 'true or false'
         if self.type is str:
             return 'a name'
-        unit = f' {self.unit}' if self.unit else ''
+        bounds = f'in [{self.minimum:g}, {self.maximum:g}] {self.unit}'.rstrip()
         if self.type is tuple:
-            return (
-                f'{NO_BOX} or six numbers in [{self.minimum:g}, {self.maximum:g}]{unit}, '
-                'in ascending pairs'
-            )
+            return f'{NO_BOX} or six numbers {bounds}, in ascending pairs'
         kind = 'an integer' if self.type is int else 'a number'
         auto = f'{AUTO} or ' if self.auto else ''
-        return f'{auto}{kind} in [{self.minimum:g}, {self.maximum:g}]{unit}'
+        return f'{auto}{kind} {bounds}'
 
     def check(self, value: object) -> ParameterValue:
         """Return `value` in the declared type; ConfigError if it is of another or out of range."""
@@ -257,7 +252,7 @@ class ParameterGroups:
         try:
             values = parameters_of(read_yaml(path))
             if not values:
-                LOGGER.warning('%s: %s', path, NO_VALUES)
+                LOGGER.warning('%s: no parameters of the segmentation in it', path)
             return (base or cls()).replace(**values)
         except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error
@@ -340,13 +335,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f'; did you mean {near[0]}?' if near else ''
 
 
-class _Loader(yaml.BaseLoader):
+class _Loader(yaml.SafeLoader):
     """Reads plain words as ROS's own parser, rcl_yaml_param_parser, does.
 
     YAML 1.1 has more: ``1_80`` and ``1:20`` are integers there, ``2026-11-28`` is a date.
     """
 
-    DEFAULT_SCALAR_TAG: Any = ''  # type: ignore[misc]  # a word behind ``!!str`` has another
+    bool_values: ClassVar[Any] = {**yaml.SafeLoader.bool_values, 'y': True, 'n': False}
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """Refuse aliases, as ROS does: a kilobyte of them can stand for gigabytes."""
@@ -356,56 +351,41 @@ class _Loader(yaml.BaseLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Refuse a key that is there twice; the last would win silently."""
-        values: dict[Any, Any] = {}
-        for key, value in node.value:
-            name = super().construct_scalar(key)
-            if name in values:
-                raise ConfigError(f'{name}: given twice, line {key.start_mark.line + 1}')
-            values[name] = self.construct_object(value, deep=True)
-        return values
-
-    def construct_scalar(self, node: yaml.ScalarNode) -> Any:
-        """Return a switch or a number where a plain word is one, and None where there is none."""
-        text = super().construct_scalar(node)
-        if node.style in ('"', "'") or node.tag == 'tag:yaml.org,2002:str':
-            return text
-        if text in _SWITCHES:
-            return _SWITCHES[text]
-        if not text.isascii() or '_' in text:  # which Python has in numbers, and C has not
-            return text
-        word = text.lower().replace('.inf', 'inf').replace('.nan', 'nan')
-        is_octal = word.lstrip('+-').isdigit() and word.lstrip('+-')[0] == '0'
-        with contextlib.suppress(ValueError):
-            number = int(word, 16 if 'x' in word else 8 if is_octal else 10)
-            if -(2**63) <= number < 2**63:
-                return number
-        with contextlib.suppress(ValueError, OverflowError):
-            value = float.fromhex(word) if 'x' in word else float(word)
-            if math.isfinite(value) or 'n' in word:
-                return value
-        return text or None
+        for name, n_times in Counter(str(key.value) for key, _ in node.value).items():
+            if n_times > 1:
+                raise ConfigError(f'{name}: given twice, line {node.start_mark.line + 1}')
+        return super().construct_mapping(node, deep)
 
 
-_SWITCHES = {
-    form: word in ('y', 'yes', 'true', 'on')
-    for word in ('y', 'yes', 'true', 'on', 'n', 'no', 'false', 'off')
-    for form in (word, word.capitalize(), word.upper())
+_SWITCHES = 'y', 'yes', 'true', 'on', 'n', 'no', 'false', 'off'
+_WORDS = {
+    'null': '',
+    'bool': '|'.join(f'{word}|{word.capitalize()}|{word.upper()}' for word in _SWITCHES),
+    'int': '[-+]?(0[0-7]*|[1-9][0-9]{,17}|0x[0-9a-fA-F]{1,15})',
+    'float': r'[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?\.?(?i:inf|nan)',
 }
+_Loader.yaml_implicit_resolvers = {}
+for _kind, _form in _WORDS.items():
+    _Loader.add_implicit_resolver(f'tag:yaml.org,2002:{_kind}', re.compile(rf'({_form})\Z'), None)
+# What launch_ros writes for a list, which rcl reads as one.
+_Loader.add_constructor(
+    'tag:yaml.org,2002:python/tuple',
+    _Loader.construct_sequence,  # type: ignore[type-var]
+)
 
 
 def read_yaml(path: str | Path) -> object:
     """Read a YAML file as `load_yaml`; ConfigError also if it cannot be read or is too large."""
     try:
-        with open(path, 'rb') as file:
-            data = file.read(MAX_FILE_BYTES + 1)
+        with open(path, encoding='utf-8') as file:
+            text = file.read(MAX_LENGTH + 1)
     except OSError as error:
         raise ConfigError(reason_of(error)) from error
-    if len(data) > MAX_FILE_BYTES:
-        raise ConfigError(f'too large for a parameter file, accepted are {MAX_FILE_BYTES} bytes')
-    try:
-        return load_yaml(data.decode('utf-8'))
     except UnicodeDecodeError as error:
         raise ConfigError('not a text file') from error
+    if len(text) > MAX_LENGTH:
+        raise ConfigError(f'too large for a parameter file, accepted are {MAX_LENGTH} characters')
+    return load_yaml(text)
 
 
 def load_yaml(text: str) -> object:
@@ -454,16 +434,14 @@ def nodes_of(document: object) -> list[tuple[str, dict[str, object]]]:
     names = dict.fromkeys(node for node, _ in ours if '*' not in node) or [ours[0][0]]
     nodes = []
     for name in names:
-        given: dict[str, Any] = {}
-        for node, values in ours:
-            given |= values if node == name or '*' in node else {}
-        nodes.append((name, given))
+        parts = [values for node, values in ours if node == name or '*' in node]
+        given = {key: value for part in parts for key, value in part.items()}
         if not isinstance(given.get('use_sim_time', False), bool):
             raise ConfigError(f'use_sim_time = {given["use_sim_time"]!r}: must be true or false')
-        if empty := [name for name, value in given.items() if value == []]:
+        if empty := [key for key, value in given.items() if value == []]:
             raise ConfigError(f'{empty[0]} = []: {EMPTY_LIST}')
-        for of_every_node in [name for name in given if name.startswith(OF_EVERY_NODE)]:
-            del given[of_every_node]
+        own = {key: given[key] for key in given if not key.startswith(OF_EVERY_NODE)}
+        nodes.append((name, own))
     return nodes
 
 
