@@ -244,7 +244,8 @@ def test_tables_hold_the_sums_of_the_frames(tmp_path, capfd):
     assert document['environment']['versions']['pypatchworkpp']
     # State of learning is that of our method only.
     assert (frames['status'].notna() == (frames['method'] == OURS)).all()
-    assert 'objects' not in document  # there are none
+    (plants,) = document['objects']  # there are no others
+    assert (plants['class'], plants['n_returns']) == ('vegetation', 300 * len(frames) // 2)
     rings = {row['range']: row for row in document['rings']}
     assert rings['> 50 m']['iou'] is rings['> 50 m']['peer_iou'] is None
     assert rings['all']['iou'] == document['groundgrid'][-1]['iou']
