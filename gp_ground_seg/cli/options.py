@@ -156,17 +156,21 @@ def read_config(arguments: argparse.Namespace) -> Config:
     return config.replace(**dict(parse_setting(setting) for setting in arguments.settings))
 
 
-def spare_compiling(config: Config, n_scans: int, *, quiet: bool = False) -> Config:
+def spare_compiling(config: Config, n_scans: int) -> Config:
     """Return parameters with the backend that is done first, where `config` leaves it open.
 
     Compiling takes about as long as `COMPILING_PAYS` scans take longer with numpy: 30 s, and 0.1 s
-    each. A note says how to have compiled code, unless `quiet`.
+    each.
     """
     if config.runtime.backend != 'auto' or n_scans >= COMPILING_PAYS or not has_to_compile():
         return config
-    if not quiet:
-        note('segmenting with numpy; to have compiled code, run gp-ground-seg warm-up once')
     return config.replace(**{'runtime.backend': 'numpy'})
+
+
+def note_spared(given: Config, used: Config) -> None:
+    """Say how to have compiled code, where `spare_compiling` has done without."""
+    if used.runtime != given.runtime:
+        note('segmented with numpy; to have compiled code, run gp-ground-seg warm-up once')
 
 
 def parse_setting(setting: str) -> tuple[str, Any]:

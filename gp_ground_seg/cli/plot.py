@@ -85,12 +85,14 @@ def run(arguments: argparse.Namespace) -> int:
     points, title, truth = scan.read().xyz, shown(scan.title), None
     if arguments.labels is not None:
         truth = true_labels(read_labels(arguments.labels, len(points)))
-    result = GroundSegmenter(options.spare_compiling(config, 1)).segment(points)
+    used = options.spare_compiling(config, 1)
+    result = GroundSegmenter(used).segment(points)
     if arguments.picture == 'scan':
         said = plot_scan_view(points, result.label, path, title, arguments.camera, truth=truth)
     else:
         said = plot_segment(result, config, points, arguments.segment, path, truth, title)
     print(f'{said}, written to {shown(path)}')
+    options.note_spared(config, used)
     return 0
 
 

@@ -96,12 +96,14 @@ def run(arguments: argparse.Namespace) -> int:
         print(f'{len(items) - len(left)} of {len(items)} were finished before')
     if not left:
         return 0
-    used = options.spare_compiling(config, count_clouds(left), quiet=arguments.quiet)
+    used = options.spare_compiling(config, count_clouds(left))
     with options.runner(arguments, 'segment') as runner:
         if parameters and (arguments.force or find_difference(folder, parameters)):
             write_file(folder / PARAMETERS, parameters.encode())
         found = runner.run(partial(segment_block, folder, used), left, size_of=count_clouds)
     _print_summary([*chain(*found)], target, runner.n_workers)
+    if not arguments.quiet:
+        options.note_spared(config, used)
     return 0
 
 

@@ -189,7 +189,7 @@ def fit_plane(x, y, z, weight):
     mean = np.average([x, y, z], axis=1, weights=weight)
     cov = np.cov([x, y, z], aweights=weight, ddof=0) if len(x) > 1 else np.zeros((3, 3))
     slope = np.linalg.solve(cov[:2, :2] + 0.5 * np.eye(2), cov[:2, 2])
-    is_determined = weight.sum() >= 1.5
+    is_determined = weight.sum() >= 2.0
     return lambda a, b: (mean[2] + slope @ [a - mean[0], b - mean[1]], is_determined)
 
 

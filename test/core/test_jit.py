@@ -251,7 +251,7 @@ def test_few_scans_do_not_wait_for_the_compiler(tmp_path):
     with start('segment', 'a.bin', '-o', 'a.label', cwd=tmp_path, env=env) as process:
         said = process.communicate(timeout=60)[1]
     assert process.returncode == 0, said
-    assert said.count('segmenting with numpy; to have compiled code, run') == 1
+    assert said.count('segmented with numpy; to have compiled code, run') == 1
     assert 'compiling' not in said
     many = options.COMPILING_PAYS
     for is_missing in (True, False):

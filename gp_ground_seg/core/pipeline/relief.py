@@ -59,7 +59,7 @@ ROBUST_SCALE = 0.15
 """Residual at which a candidate counts half [m]."""
 RIDGE = 0.5
 """Variance that is added to those of x and y [m^2]: planes through few places are more level."""
-MIN_WEIGHT = 1.5
+MIN_WEIGHT = 2.0
 """Least weight of a plane, where a square with candidates counts one."""
 FADED, FADE_WIDTH = 0.15, 0.3
 """Height of the land up to which the relief is level, and over which it then grows to it [m]."""
