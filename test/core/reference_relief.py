@@ -16,7 +16,9 @@ def find_relief(candidates, faces, height, config):
         known, pieces = [], []
         for side in map(sorted, reached_on_foot(candidates, faces, height, config)):
             x, y, z = (getattr(candidates, name)[side] for name in 'xyz')
-            heights = fit_squares(x, y, z + height)
+            heights, occupied = fit_squares(x, y, z + height)
+            for square in raised_parts(heights, occupied):
+                del heights[square]
             known.append(heights)
             pieces.append(pieces_on(heights, x, y))
         if any(abs(h) > 0.15 for heights in known for h in heights.values()):
@@ -44,7 +46,7 @@ def rings_to(piece, others):
 
 
 def reached_on_foot(candidates, faces, height, config):
-    """Candidates in the groups, joined by steps, that have eight seeds.
+    """Candidates in the groups, joined by steps, that have eight seeds; raised parts entered.
 
     Those before a fall, and those behind one.
     """
@@ -86,6 +88,16 @@ def reached_on_foot(candidates, faces, height, config):
                 fallen |= front & set(falls)
                 for a, b in front - set(falls):
                     join(a, b)
+    raised = {c for c in allowed if z[c] + height > 0.3}
+    land = set(allowed)
+    for part in groups_of(raised, lambda c: beside[c] & raised):
+        entries = {c for c in part if beside[c] - raised}
+        nearest = {
+            segment[c]: min(r[e] for e in entries if segment[e] == segment[c]) for c in entries
+        }
+        if sum(2.0 * math.pi / n_segments * r_entry for r_entry in nearest.values()) < 1.5:
+            land -= part
+    fallen = {step for step in fallen if set(step) <= land}
     for a, b in fallen:
         join(a, b)
     seeds = {
@@ -94,7 +106,7 @@ def reached_on_foot(candidates, faces, height, config):
         if r[c] < growth.seed_range and abs(z[c] + height) < growth.seed_height_tolerance
     }
     groups = groups_of(allowed, lambda c: beside[c])
-    reached = {c for group in groups if len(seeds & group) >= 8 for c in group}
+    reached = {c for group in groups if len(seeds & group) >= 8 for c in group} & land
     behind = set()
     for c in reached:
         edges = [a for a, b in fallen if b in reached and segment[b] == segment[c] and b <= c]
@@ -181,7 +193,8 @@ def fit_squares(x, y, z):
             weight[c] = 1.0 / len(own[square]) / (1.0 + (residual / 0.15) ** 2)
     middles = {square: [2.0 * k - 59.0 for k in square] for square in planes}
     heights = {square: planes[square](*middles[square]) for square in planes}
-    return {square: h for square, (h, is_determined) in heights.items() if is_determined}
+    known = {square: h for square, (h, is_determined) in heights.items() if is_determined}
+    return known, set(squares)
 
 
 def fit_plane(x, y, z, weight):
@@ -189,8 +202,18 @@ def fit_plane(x, y, z, weight):
     mean = np.average([x, y, z], axis=1, weights=weight)
     cov = np.cov([x, y, z], aweights=weight, ddof=0) if len(x) > 1 else np.zeros((3, 3))
     slope = np.linalg.solve(cov[:2, :2] + 0.5 * np.eye(2), cov[:2, 2])
-    is_determined = weight.sum() >= 2.0
+    is_determined = weight.sum() >= 1.5
     return lambda a, b: (mean[2] + slope @ [a - mean[0], b - mean[1]], is_determined)
+
+
+def raised_parts(known, occupied):
+    """Squares that are 0.3 m high or deep, with fewer than nine occupied ones side by side."""
+    raised = {square for square, h in known.items() if abs(h) > 0.3}
+
+    def beside(square):
+        return [s for s in around(square) if abs(s[0] - square[0]) + abs(s[1] - square[1]) == 1]
+
+    return [square for g in groups_of(raised, beside) if len(g & occupied) < 9 for square in g]
 
 
 def fill_rings(known):

@@ -6,6 +6,7 @@ Tables of squares have one more at each side, so that each square has eight arou
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,12 +23,15 @@ from gp_ground_seg.core.parameters.config import GrowthConfig
 from gp_ground_seg.core.pipeline.relief import (
     FADED,
     GENTLE,
+    MIN_ENTRY,
+    MIN_RAISED,
     MIN_SEEDS,
     MIN_WEIGHT,
     MIN_WIDTH,
     N_ASIDE,
     N_ROUNDS,
     N_SIDES,
+    RAISED,
     REACH,
     STEEP,
     arc_of,
@@ -66,10 +70,10 @@ def find_relief(
     Where it is, nothing is set.
     """
     before, behind = reachable(candidates, is_face, height, growth)
-    land, is_known = _fit_planes(candidates, before, height)
+    land, is_known = _land_of(candidates, before, height)
     below, is_known_below = land, np.zeros(_N_SQUARES, np.bool_)
     if behind.any():
-        below, is_known_below = _fit_planes(candidates, behind, height)
+        below, is_known_below = _land_of(candidates, behind, height)
     if max(_highest(land, is_known), _highest(below, is_known_below)) <= FADED:
         return True
     is_behind = np.zeros(_N_SQUARES, np.bool_)
@@ -80,6 +84,16 @@ def find_relief(
     for c in range(len(z)):
         z[c] = candidates.z[c] - height_at(pieces, candidates.x[c], candidates.y[c])
     return False
+
+
+@jit()
+def _land_of(
+    candidates: Candidates, chosen: BoolArray, height: float
+) -> tuple[FloatArray, BoolArray]:
+    """See the plain `_land_of`."""
+    land, is_known, number = _fit_planes(candidates, chosen, height)
+    _leave_out_small(land, is_known, number)
+    return land, is_known
 
 
 @jit()
@@ -160,8 +174,8 @@ def _place(i: int, j: int) -> int:
 @jit()
 def _fit_planes(
     candidates: Candidates, reached: BoolArray, height: float
-) -> tuple[FloatArray, BoolArray]:
-    """Heights of the land, and which are known, of all squares.
+) -> tuple[FloatArray, BoolArray, IntArray]:
+    """Heights of the land, which are known, and numbers of candidates, of all squares.
 
     See the plain `fit_planes`.
     """
@@ -191,7 +205,7 @@ def _fit_planes(
                 _set_plane(sums[k], plane[k])
                 is_known[k] = True
                 land[k] = height_of(plane[k], middle_of(i), middle_of(j))
-    return land, is_known
+    return land, is_known, number
 
 
 @jit()
@@ -231,6 +245,29 @@ def _sums_around(
     for k in range(column, np.uintp(len(own)) - column):
         around[k] = rows[k - row] + rows[k] + rows[k + row]
     return around.reshape(_N_SQUARES, _N_SUMS)
+
+
+@jit()
+def _leave_out_small(land: FloatArray, is_known: BoolArray, number: IntArray) -> None:
+    """See the plain `leave_out_small`."""
+    is_seen, part = np.zeros(_N_SQUARES, np.bool_), np.empty(_N_SQUARES, np.int64)
+    for start in range(_N_SQUARES):
+        n = stop = 0
+        if is_known[start] and abs(land[start]) > RAISED and not is_seen[start]:
+            part[0], is_seen[start], stop = start, True, 1
+        while n < stop:
+            for step in (-_WIDTH, -1, 1, _WIDTH):
+                k = part[n] + step
+                if is_known[k] and abs(land[k]) > RAISED and not is_seen[k]:
+                    part[stop], is_seen[k] = k, True
+                    stop += 1
+            n += 1
+        n_occupied = 0
+        for n in range(stop):
+            n_occupied += number[part[n]] > 0
+        if n_occupied < MIN_RAISED:
+            for n in range(stop):
+                is_known[part[n]] = False
 
 
 @jit()
@@ -281,32 +318,48 @@ def _mean_around(land: FloatArray, is_known: BoolArray, k: int) -> float:
 # Which candidates are land.
 
 
+class _Walk(NamedTuple):
+    """What the steps taken so far lead to."""
+
+    parent: IntArray  # (C,) a tree for each group of candidates that steps join
+    is_raised: BoolArray  # (C,) candidates that are raised
+    part: IntArray  # (C,) as `parent`, by steps between raised candidates alone
+    is_entry: BoolArray  # (C,) raised candidates that a step from one that is not leads to
+    is_fallen: BoolArray  # (C,) candidates that a fall leads to
+
+
 @jit()
 def reachable(
     candidates: Candidates, is_face: BoolArray, height: float, growth: GrowthConfig
 ) -> tuple[BoolArray, BoolArray]:
     """See the plain `reachable`."""
     r, n = candidates.r, len(candidates.r)
-    allowed, is_fallen, parent = np.empty(n, np.bool_), np.zeros(n, np.bool_), _trees(n)
+    allowed, is_raised = np.empty(n, np.bool_), np.empty(n, np.bool_)
     for c in range(n):
         allowed[c] = r[c] < REACH and not is_face[np.uintp(candidates.tile[c])]
-    steep, down = _step_along(candidates, allowed, parent, is_fallen)
+        is_raised[c] = candidates.z[c] + height > RAISED
+    walk = _Walk(_trees(n), is_raised, _trees(n), np.zeros(n, np.bool_), np.zeros(n, np.bool_))
+    steep, down = _step_along(candidates, allowed, walk)
     for aside in range(1, N_ASIDE + 1):
-        _step_aside(candidates, allowed, aside, parent)
-    _step_in_front(candidates, steep, parent, is_fallen)
-    _step_in_front(candidates, down, parent, is_fallen)
-    n_seeds = np.zeros(n, np.int64)
+        _step_aside(candidates, allowed, aside, walk)
+    _step_in_front(candidates, steep, walk)
+    _step_in_front(candidates, down, walk)
+    is_land = allowed.copy()
+    _leave_out_not_entered(candidates, walk, is_land)
+    parent, n_seeds = walk.parent, np.zeros(n, np.int64)
     for c in range(n):
-        if is_fallen[c]:
+        if walk.is_fallen[c] and is_land[c] and is_land[c - 1]:
             _join(parent, c - 1, c)
+        else:
+            walk.is_fallen[c] = False
     for c in range(n):
         parent[c] = _root(parent, c)
         is_near = allowed[c] and r[c] < growth.seed_range
         if is_near and abs(candidates.z[c] + height) < growth.seed_height_tolerance:
             n_seeds[parent[c]] += 1
     for c in range(n):
-        allowed[c] &= n_seeds[parent[c]] >= MIN_SEEDS
-    return _sides_of(candidates, allowed, is_fallen)
+        is_land[c] &= n_seeds[parent[c]] >= MIN_SEEDS
+    return _sides_of(candidates, is_land, walk.is_fallen)
 
 
 @jit()
@@ -326,8 +379,37 @@ def _sides_of(
 
 
 @jit()
+def _step(walk: _Walk, a: int, b: int) -> None:
+    """Take a step between two candidates."""
+    _join(walk.parent, a, b)
+    if walk.is_raised[a] and walk.is_raised[b]:
+        _join(walk.part, a, b)
+    elif walk.is_raised[a]:
+        walk.is_entry[a] = True
+    elif walk.is_raised[b]:
+        walk.is_entry[b] = True
+
+
+@jit()
+def _leave_out_not_entered(candidates: Candidates, walk: _Walk, reached: BoolArray) -> None:
+    """See the plain `_entered`. A part of raised land is reached as a whole, or not at all."""
+    r, n, offsets = candidates.r, len(reached), candidates.offsets
+    width, last = np.zeros(n), np.zeros(n, np.int64)
+    for m in range(len(offsets) - 1):
+        for c in range(offsets[m], offsets[m + 1]):
+            if walk.is_entry[c]:
+                part = _root(walk.part, c)
+                # One more than the segment, as 0 is none.
+                if last[part] != m + 1:
+                    width[part] += arc_of(r[c], len(offsets) - 1)
+                    last[part] = m + 1
+    for c in range(n):
+        reached[c] &= not walk.is_raised[c] or width[_root(walk.part, c)] >= MIN_ENTRY
+
+
+@jit()
 def _step_along(
-    candidates: Candidates, allowed: BoolArray, parent: IntArray, is_fallen: BoolArray
+    candidates: Candidates, allowed: BoolArray, walk: _Walk
 ) -> tuple[IntArray, IntArray]:
     """Step between neighbours of a segment.
 
@@ -347,13 +429,13 @@ def _step_along(
             else:
                 is_taken = can_step(dr, rise, STEEP)
                 if is_taken and abs(rise) <= GENTLE:
-                    _join(parent, c - 1, c)
+                    _step(walk, c - 1, c)
                     continue
-            is_fallen[c] = not is_taken and falls(dr, rise)
+            walk.is_fallen[c] = not is_taken and falls(dr, rise)
             if is_taken:
                 steep[n] = c
                 n += 1
-            if is_fallen[c] or (is_taken and rise < 0.0):
+            if walk.is_fallen[c] or (is_taken and rise < 0.0):
                 down[n_down] = c
                 n_down += 1
     return steep[:n], down[:n_down]
@@ -373,9 +455,7 @@ def _goes_on(candidates: Candidates, first: int, c: int) -> bool:
 
 
 @jit()
-def _step_in_front(
-    candidates: Candidates, steep: IntArray, parent: IntArray, is_fallen: BoolArray
-) -> None:
+def _step_in_front(candidates: Candidates, steep: IntArray, walk: _Walk) -> None:
     """Take the steep and long steps in a front; `steep` (S,) are their far ends, in order.
 
     Falls that are not in one are none.
@@ -399,10 +479,10 @@ def _step_in_front(
         width[front[k]] += arc_of(candidates.r[steep[k] - 1], n_segments)
     for k in range(len(steep)):
         is_wide = width[front[k]] >= MIN_WIDTH
-        if is_fallen[steep[k]]:
-            is_fallen[steep[k]] = is_wide
+        if walk.is_fallen[steep[k]]:
+            walk.is_fallen[steep[k]] = is_wide
         elif is_wide:
-            _join(parent, steep[k] - 1, steep[k])
+            _step(walk, steep[k] - 1, steep[k])
 
 
 @jit()
@@ -422,7 +502,7 @@ def _join_front(
 
 
 @jit()
-def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, parent: IntArray) -> None:
+def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, walk: _Walk) -> None:
     """Step from each candidate to the next ones in range of the segment so many further on."""
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     n_segments = len(offsets) - 1
@@ -438,11 +518,14 @@ def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, parent: 
             across, gap = aside * arc_of(r[c], n_segments), 0.5 * largest_gap(r[c])
             for there in range(max(behind - 1, first), min(behind + 1, stop)):
                 dr = abs(r[there] - r[c])
-                # Most are joined already.
-                if parent[c] != parent[there] and allowed[there] and dr <= gap:
+                # Most are joined already; of raised ones it also matters what leads to them.
+                is_done = walk.parent[c] == walk.parent[there]
+                if is_done and not (walk.is_raised[c] or walk.is_raised[there]):
+                    continue
+                if allowed[there] and dr <= gap:
                     distance = math.sqrt(dr * dr + across * across)
                     if can_step(distance, z[there] - z[c], GENTLE):
-                        _join(parent, c, there)
+                        _step(walk, c, there)
 
 
 @jit()
