@@ -42,6 +42,7 @@ _RULES = {
     'node namespace': _NAMES,
     'parameter override rule': 'must be NAME:=VALUE, as in sensor.height:=1.2',
     'use_sim_time': 'must be true or false',
+    'PARAMETER_NOT_SET': f'an empty list: {EMPTY_LIST}',
     'severity level': 'must be debug, info, warn, error or fatal, or NAME:= one of them',
     'Enclave name': 'as in /front/lidar',
     'failed to initialize logging': LOG_FOLDER,

@@ -16,7 +16,7 @@ from rclpy.parameter_service import ParameterService
 
 from gp_ground_seg.core.errors import ConfigError, GroundSegError
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.core.parameters.schema import EMPTY_LIST, ParameterSpec
+from gp_ground_seg.core.parameters.schema import OF_EVERY_NODE, ParameterSpec
 from gp_ground_seg.ros.arguments import start_errors
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
 
@@ -74,14 +74,26 @@ class ConfiguredNode(Node):  # type: ignore[misc]
     """
 
     def __init__(self, name: str, **options: Any) -> None:
+        # Declared from the overrides to learn which names were given; then again, typed.
         with start_errors():
-            super().__init__(name, start_parameter_services=False, **options)
-        given = {name: parameter.value for name, parameter in self._parameter_overrides.items()}
-        for empty in [name for name, value in given.items() if value is None]:
-            raise ConfigError(f'{empty} is an empty list: {EMPTY_LIST}')
-        check_overrides(given)
-        self._config = changed(Config(), self._parameter_overrides.values())
+            super().__init__(
+                name,
+                automatically_declare_parameters_from_overrides=True,
+                start_parameter_services=False,
+                **options,
+            )
+        every = self.get_parameters_by_prefix('').items()
+        self._given = {name: given for name, given in every if name not in OF_EVERY_NODE}
+        # rclpy logs the error and goes on.
+        use_sim_time = self.get_parameter('use_sim_time').value
+        if not isinstance(use_sim_time, bool):
+            raise ConfigError(f'use_sim_time = {use_sim_time!r}: must be true or false')
+        values = {name: parameter.value for name, parameter in self._given.items()}
+        check_overrides(values)
+        self._config = changed(Config(), self._given.values())
         self.check_config(self._config)
+        for given in self._given:
+            self.undeclare_parameter(given)
         with start_errors():
             for spec in parameter_specs():
                 value = self._config[spec.name]
@@ -108,7 +120,7 @@ class ConfiguredNode(Node):  # type: ignore[misc]
 
     def warn_of_unused_parameters(self) -> None:
         """Log what was given and is not declared; call it after all topics are made."""
-        for name in sorted(self._parameter_overrides):
+        for name in sorted(self._given):
             if not self.has_parameter(name):
                 is_qos = name.startswith(QOS_OVERRIDES)
                 reason = 'no such topic or policy here' if is_qos else _unknown(name)
