@@ -266,10 +266,8 @@ class GroundSegmenter:
         if fallback is not None:
             pose = with_fallback(pose, fallback, sensor)
         config = for_sensor(config, pose)
-        if (pose.roll, pose.pitch) != (
-            given.roll,
-            given.pitch,
-        ) or config.grid != self._config.grid:
+        is_turned = (pose.roll, pose.pitch) != (given.roll, given.pitch)
+        if is_turned or config.grid != self._config.grid:
             scan = backend.build_grid(pose.level(about), config)
         if objection == LOWER_ENDS and pose.is_height_default:
             nothing = np.zeros(len(scan.candidates.r), dtype=np.bool_)

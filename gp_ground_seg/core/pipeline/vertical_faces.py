@@ -44,8 +44,6 @@ wide as coordinates are rounded to. What is left is rounding, and has no orienta
 UNITS_PER_METRE = 2.0**16
 """Coordinates are rounded to units of 15 um: squares and products within a tile, and sums of two
 hundred thousand of them, are then exact, so that their order does not matter."""
-
-
 MIN_WIDTH = 0.05
 """Least standard deviation of the returns of a tile, in all directions but one, of which the
 scatter about their plane is known [m]: more than that of one ring by noise of its ranges."""
