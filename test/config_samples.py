@@ -13,7 +13,7 @@ def accepted_values(spec):
     if spec.choices:
         return st.sampled_from(spec.choices)
     if spec.type is str:
-        return st.from_regex(r'[A-Za-z0-9_./-]{1,20}', fullmatch=True)
+        return st.from_regex(r'[A-Za-z0-9_.-][A-Za-z0-9_./-]{0,19}', fullmatch=True)
     if spec.type is bool:
         return st.booleans()
     if spec.type is tuple:

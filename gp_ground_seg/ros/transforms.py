@@ -19,7 +19,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import Imu, PointCloud2
 from std_msgs.msg import Header
 
-from gp_ground_seg.core.errors import ConfigError, MissingDependencyError, PointCloudError
+from gp_ground_seg.core.errors import MissingDependencyError, PointCloudError
 from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.core.parameters.config import NO_FRAME, Config
 from gp_ground_seg.core.pipeline.points import angles_of
@@ -47,12 +47,8 @@ def find_module(name: str) -> Any:
 
 
 def check_tf2(config: Config) -> None:
-    """Raise a GroundSegError if TF is asked for, and is not installed or refuses a name."""
+    """Raise a GroundSegError if TF is asked for, and is not installed."""
     frame = config.frame
-    for name in ('base', 'sensor'):
-        given = getattr(frame, name)
-        if given.startswith('/'):
-            raise ConfigError(f'frame.{name} = {given!r}: must not begin with /, as tf2 wants')
     if is_tf_used(config) and find_module('tf2_ros') is None:
         asked = 'level = tf' if frame.level == 'tf' else f'sensor = {frame.sensor}'
         raise MissingDependencyError(

@@ -81,7 +81,7 @@ def test_a_box_is_six_numbers_or_none():
 
 
 WORD, CHOICE, SWITCH, CROP = 'frame.base', 'label.rule', 'surface.look_aside', 'input.crop_box'
-NO_WORDS = '', 'two words', 'ümlaut', 'a\n', 1, True, None
+NO_WORDS = '', 'two words', 'ümlaut', 'a\n', '/base', 1, True, None
 SWAPPED = 0.5, -1.0, *BOX[2:]
 LIMITS = [
     ('grid.r_min', 'grid.r_max', 20.0, 30.0),
@@ -90,7 +90,7 @@ LIMITS = [
     ('output.min_height', 'output.max_height', 1.0, 2.0),
 ]
 REFUSED = [
-    *(({WORD: word}, '= .*: must be a name$') for word in NO_WORDS),
+    *(({WORD: word}, '= .*: must be a name that does not begin with /$') for word in NO_WORDS),
     *(({CHOICE: word}, ': must be one of roughness, tol') for word in (*NO_WORDS, 'Roughness')),
     *(({SWITCH: value}, ': must be true or false') for value in (1, 'true', None)),
     *(

@@ -23,7 +23,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Header
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.core.errors import ConfigError, PointCloudError
+from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.lab.simulation import VLP_16, simulate_scan
 from gp_ground_seg.ros import transforms
@@ -123,12 +123,6 @@ def test_what_tf_sends_is_kept_and_its_newest_stamp_known():
     message = types.SimpleNamespace(transforms=known)
     assert transforms.keep_transforms(lambda one, _: kept.append(one), message) == 7.0
     assert kept == known
-
-
-@pytest.mark.parametrize('name', ['base', 'sensor'])
-def test_names_of_frames_are_refused_as_tf2_does(name):
-    with pytest.raises(ConfigError, match=rf"^frame.{name} = '/base': must not begin with /"):
-        transforms.check_tf2(Config().replace(**{f'frame.{name}': '/base'}))
 
 
 def cloud_of(points, seconds, nanosec=0):

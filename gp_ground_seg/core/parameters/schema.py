@@ -69,7 +69,7 @@ class ParameterSpec:
         if self.type is bool:
             return 'true or false'
         if self.type is str:
-            return 'a name'
+            return 'a name that does not begin with /'
         bounds = f'in [{self.minimum:g}, {self.maximum:g}] {self.unit}'.rstrip()
         if self.type is tuple:
             return f'{NO_BOX} or six numbers {bounds}, in ascending pairs'
@@ -85,8 +85,8 @@ class ParameterSpec:
         elif self.auto and isinstance(value, str) and value == AUTO:
             checked = AUTO
         elif self.type is str:
-            # A name is letters, digits and ``_-./``.
-            known = self.choices or re.findall(r'\A[\w\-./]+\Z', str(value), re.ASCII)
+            # Letters, digits and ``_-./``; tf2 refuses a frame that begins with /.
+            known = self.choices or re.findall(r'\A(?!/)[\w\-./]+\Z', str(value), re.ASCII)
             checked = value if isinstance(value, str) and value in known else None
         else:
             checked = self._box(value) if self.type is tuple else self._number(value)
