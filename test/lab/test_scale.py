@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import __version__
-from gp_ground_seg.core.errors import DataError, GroundSegError
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.lab import cluster
 
 dask, distributed = pytest.importorskip('dask'), pytest.importorskip('distributed')
@@ -172,12 +172,6 @@ def test_results_are_those_of_one_process_also_if_a_worker_dies(scheduler, tmp_p
             workers.run(_fail, range(40))
         with pytest.raises(DataError, match=r'^7 to 7: each worker that computed this block died'):
             workers.run(_die, [7])
-
-
-def test_a_scheduler_with_keys_answers_nobody_without(locked_scheduler, monkeypatch):
-    monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT', 0.5)
-    with pytest.raises(GroundSegError, match='does not answer'):
-        cluster.open_runner(None, locked_scheduler[0], cluster._NO_BAR).__enter__()
 
 
 def test_workers_speak_tls_and_are_seen_on_this_machine_only():
