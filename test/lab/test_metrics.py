@@ -38,7 +38,7 @@ def test_ratios_by_hand():
 def test_counts_of_rings_by_hand():
     """A ring has its nearer edge; what is not finite has none; an unknown label is an obstacle."""
     x = np.array([0.0, 9.9, 10.0, -49.9, 50.0, 3e3, np.nan, np.inf, 5.0], np.float32)
-    xy, unknown = np.stack([x, 0.0 * x], axis=-1), Label.UNKNOWN
+    xy, unknown = np.stack([x, np.zeros_like(x)], axis=-1), Label.UNKNOWN
     label = np.array([1, 2, 1, 2, unknown, 2, 1, 1, 1], np.uint8)
     truth = np.array([1, 1, 2, 2, 1, 2, 1, 1, unknown], np.uint8)
     rings = metrics.count_rings(label, truth, xy)

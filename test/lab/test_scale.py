@@ -3,10 +3,7 @@
 import json
 import logging
 import os
-import re
 import signal
-import subprocess
-import sys
 import time
 from functools import partial
 
@@ -234,29 +231,6 @@ def test_processes_that_are_stopped_leave_nothing_half_done(moment, victim, tmp_
     found = label_files(out)
     assert len(found) == n_scans and len({*found.values()}) == 1
     assert len([*(out / 'sequences/00/predictions').iterdir()]) == n_scans
-
-
-@pytest.mark.slow
-def test_a_scheduler_that_ends_meanwhile(root, tmp_path):
-    """As the machine that it runs on may."""
-    words = [sys.executable, '-m', 'distributed.cli.dask_scheduler', '--no-dashboard', '--host']
-    with subprocess.Popen(
-        [*words, 'tcp://127.0.0.1', '--port', '0'], stderr=subprocess.PIPE, text=True
-    ) as scheduler:
-        address = next(
-            found[0] for line in scheduler.stderr if (found := re.findall(r'tcp://[\d.:]+', line))
-        )
-        process = start('segment', root, '-o', tmp_path / 'out', '--scheduler', address)
-        for line in process.stderr:
-            if 'no worker yet' in line:
-                break
-        time.sleep(1.0)
-        scheduler.kill()
-        assert process.communicate(timeout=60) == (
-            '', 'gp-ground-seg: error: the scheduler is lost\n'
-        )  # fmt: skip
-        assert process.returncode == 2
-    assert not [*tmp_path.rglob('*.label')]
 
 
 def test_a_worker_of_another_version_is_refused():
