@@ -45,8 +45,7 @@ def test_counts_of_rings_by_hand():
     assert [ring.pop('range') for ring in rings] == [*metrics.RING_TITLES]
     assert (metrics.RING_TITLES[0], metrics.RING_TITLES[-1]) == ('0-10 m', '> 50 m')
     found = [tuple(ring[name] for name in COUNTS) for ring in rings]
-    nothing = (0, 0, 0, 0)
-    between = [nothing] * (len(rings) - 4)
+    between = [(0, 0, 0, 0)] * (len(rings) - 4)
     assert found == [(1, 0, 1, 0), (0, 1, 0, 0), *between, (0, 0, 0, 1), (0, 0, 1, 1)]
 
 

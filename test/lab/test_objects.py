@@ -24,8 +24,6 @@ from gp_ground_seg.lab.scoring.objects import (
 )
 
 LOW = [*CLASSES].index(LOW_CLASSES[0])
-
-
 # Class, number, height over the ground, so many returns, and those of them called ground.
 RETURNS = [
     (0, 1, 0.3, 10, 6), (0, 2, 0.31, 12, 6), (0, 3, 1.0, 9, 9), (0, 0, 1.0, 20, 20),
