@@ -177,7 +177,7 @@ def score_rows(
     load: Callable[[Any], KnownScan],
     methods: Sequence[Method],
     items: Sequence[Any],
-    progress: Progress = iter,
+    progress: Progress,
     *,
     each_alone: bool,
 ) -> Rows:
