@@ -55,7 +55,7 @@ UNKNOWN = -1.0
 """Square of a scatter that is not known [m^2]."""
 SCATTERED = Window(2, 0.75, 4)
 """Window of the raised tiles among which many may scatter: of 6 m, for tiles of 0.5 m."""
-SMOOTH, TIMES_OWN, OWN_SHARE = 0.025, 4.0, 0.75
+SMOOTH, TIMES_OWN, OWN_SHARE = 0.025, 4.5, 0.75
 """Scatter up to which land is smooth [m]: terrain of KITTI has 0.003 to 0.02, beds and stairs 0.03
 to 0.06; what it may be as a multiple of that of the own level, of which this share is smoother."""
 SAMPLED = 2
