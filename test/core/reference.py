@@ -105,8 +105,13 @@ def find_faces(scan, height, config):
     own = LEVELS[sorted(owned)[int(0.75 * (len(owned) - 1))] if owned else 0]
     for t in level:
         about = LEVELS[level_about(scan.tiles, level, t, 4, 0.75, 4 * [0])] / 4.0
-        if scan.tiles.extremes[t, 0] + height > least and about > max(0.025, own):
+        if scan.tiles.extremes[t, 0] + height > least and about > max(0.025, 1.125 * own):
             result.is_face[t] = result.has_occluded_base[t] = True
+    before, c = {}, scan.candidates
+    for r, z, m, t in zip(c.r, c.z, c.segment, c.tile, strict=True):
+        if r - before.get(m, 0.0) > 1.0 + 0.4 * r and z + height < -least:
+            result.has_occluded_base[t] = result.is_face[t]
+        before[m] = r
     return result
 
 
@@ -227,7 +232,7 @@ def continues_line(candidates, lines, config):
 # Labels (Algorithm 2, line 14)
 
 
-def label_points(scan, faces, surface, relief, config):
+def label_points(scan, faces, surface, relief, sensor_height, config):
     """Label each point by its height over the surface, against the band of its tile."""
     grid, label, n_points = scan.grid, config.label, len(scan.xyz)
     height, margin = np.full((2, n_points), np.nan)
@@ -247,7 +252,8 @@ def label_points(scan, faces, surface, relief, config):
         roughness = rough.get(scan.tiles.tile[i], 0.0) if by_roughness else 0.0
         band, depth = label.ground_tolerance, label.ground_tolerance
         if label.rule == 'roughness':
-            band, depth = max(min(2.1 * roughness, 0.5), band), label.obstacle_max_height
+            band = max(min(2.1 * roughness, 0.5), band)
+            depth = min(sensor_height, 1.0) * label.obstacle_max_height
         margin[i] = min(band - height[i], height[i] + depth)
         if is_face[i]:
             limit = max(0.5 * label.ground_tolerance, min(2.1 * roughness, 0.05))

@@ -16,9 +16,7 @@ def find_relief(candidates, faces, height, config):
         known, pieces = [], []
         for side in map(sorted, reached_on_foot(candidates, faces, height, config)):
             x, y, z = (getattr(candidates, name)[side] for name in 'xyz')
-            heights, occupied = fit_squares(x, y, z + height)
-            for square in raised_parts(heights, occupied):
-                del heights[square]
+            heights = fit_squares(x, y, z + height)
             known.append(heights)
             pieces.append(pieces_on(heights, x, y))
         if any(abs(h) > 0.15 for heights in known for h in heights.values()):
@@ -194,7 +192,7 @@ def fit_squares(x, y, z):
     middles = {square: [2.0 * k - 59.0 for k in square] for square in planes}
     heights = {square: planes[square](*middles[square]) for square in planes}
     known = {square: h for square, (h, is_determined) in heights.items() if is_determined}
-    return known, set(squares)
+    return known
 
 
 def fit_plane(x, y, z, weight):
@@ -204,16 +202,6 @@ def fit_plane(x, y, z, weight):
     slope = np.linalg.solve(cov[:2, :2] + 0.5 * np.eye(2), cov[:2, 2])
     is_determined = weight.sum() >= 1.5
     return lambda a, b: (mean[2] + slope @ [a - mean[0], b - mean[1]], is_determined)
-
-
-def raised_parts(known, occupied):
-    """Squares that are 0.3 m high or deep, with fewer than nine occupied ones side by side."""
-    raised = {square for square, h in known.items() if abs(h) > 0.3}
-
-    def beside(square):
-        return [s for s in around(square) if abs(s[0] - square[0]) + abs(s[1] - square[1]) == 1]
-
-    return [square for g in groups_of(raised, beside) if len(g & occupied) < 9 for square in g]
 
 
 def fill_rings(known):

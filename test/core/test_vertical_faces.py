@@ -57,6 +57,19 @@ def test_returns_above_one_place_have_no_direction(backend):
         assert is_face.all() and not is_occluded.any()
 
 
+def test_a_face_below_an_edge_shows_no_ground(backend):
+    face = CORNER + PLANES[0.3] - [0.0, 0.0, 1.0]
+    before = face * [0.85, 0.85, 0.0] - [0.0, 0.0, 1.0]
+    for xyz, height, is_beyond in (
+        (face, 0.0, True),
+        (face, 1.0, False),
+        ([*before, *face], 0.0, False),
+    ):
+        is_face, is_occluded, _ = faces_of(backend, xyz, height, max_foot_distance=0.0)
+        assert is_face[-60:].all()
+        assert (is_occluded[-60:] == is_beyond).all()
+
+
 @settings(max_examples=fewer(30, 10))
 @given(st.integers(0, 10_000), st.sampled_from([np.float32, np.float64]))
 def test_faces_are_the_reference(backend, seed, dtype):
