@@ -74,7 +74,7 @@ def find_faces(scan, height, config):
     """
     faces, label = config.faces, config.label
     limit, least = label.obstacle_max_height, label.obstacle_min_height + label.ground_tolerance
-    result, scatter, owned = Faces.none(scan.tiles), {}, []
+    result, place, scatter, owned = Faces.none(scan.tiles), scan.tiles.place, {}, []
     for t in np.unique(scan.tiles.tile[scan.tiles.tile >= 0]):
         own = scan.xyz[scan.tiles.tile == t].astype(np.float64)
         above = own[:, 2] - own[:, 2].min()
@@ -88,9 +88,7 @@ def find_faces(scan, height, config):
             spread = math.sqrt(max(value.prod(), 0.0) / minors)
             if lowest > 0.5 * least:
                 scatter[t] = spread
-            elif (
-                lowest > -0.5 * least and highest - lowest <= least and not scan.tiles.place[t] % 2
-            ):
+            elif lowest > -0.5 * least and highest - lowest <= least and not place[t] % 2:
                 owned.append(level_of(4.0 * spread))
         if above.max() <= least:
             continue
