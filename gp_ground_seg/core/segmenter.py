@@ -35,7 +35,7 @@ from gp_ground_seg.core.pipeline.ground_view import (
     is_doubtful,
     objection_to_ground,
 )
-from gp_ground_seg.core.pipeline.low_sensor import for_sensor
+from gp_ground_seg.core.pipeline.low_sensor import for_sensor, sensor_height_of
 from gp_ground_seg.core.pipeline.mirror_images import (
     MIRRORED,
     NO_IMAGES,
@@ -163,18 +163,17 @@ class GroundSegmenter:
         # 2. Sensor pose, from a plane through the candidates near the sensor: a tilted scan is
         #    levelled, mirror images are raised, and a low sensor has narrower gates.
         scan, pose, images, config = self._level(xyz, sensor, timer, fallback)
+        height = pose.sensor_height
         # 3. Vertical faces: walls, fences, sides of cars.
-        faces = backend.find_faces(scan, pose.sensor_height, config)
+        faces = backend.find_faces(scan, height, config)
         timer.mark('faces')
         # 4. Relief of the land. Lines along each segment, over it, without lowest points of faces
         #    with occluded base, and pseudo-inputs. The prior mean is the ground below the sensor.
-        relief, candidates = backend.find_relief(
-            scan.candidates, faces, pose.sensor_height, config
-        )
+        relief, candidates = backend.find_relief(scan.candidates, faces, height, config)
         candidates, lines, pseudo, onward, in_face = backend.extract_lines(
             candidates, faces, config
         )
-        knots, prior_mean = scan.grid.edges, -pose.sensor_height
+        knots, prior_mean = scan.grid.edges, -height
         frame = Frame(candidates, lines, pseudo, onward, in_face, knots, prior_mean)
         timer.mark('lines')
         # 5. Observation and latent process: hyper-parameters theta, inliers and surface.
@@ -184,7 +183,8 @@ class GroundSegmenter:
         surface, log_length_scale, _ = backend.estimate_surface(frame, learned.theta, config)
         timer.mark('surface')
         # 6. Labels: ground up to the tolerance over the surface, or higher where it is rough.
-        labelled = backend.label_points(scan, faces, surface, relief, config)
+        height = sensor_height_of(pose)
+        labelled = backend.label_points(scan, faces, surface, relief, height, config)
         labelled.height[images.points] -= images.rise
         timer.mark('label')
         return Segmentation(

@@ -39,7 +39,7 @@ def labels_of(backend, points):
     knots.setflags(write=False)  # as a frame has them: another type would be compiled by itself
     surface = GroundSurface(knots, mean, std, np.ones(0, dtype=bool))
     scan = backend.build_grid(points, config)
-    return backend.label_points(scan, Faces.none(scan.tiles), surface, LEVEL, config)
+    return backend.label_points(scan, Faces.none(scan.tiles), surface, LEVEL, 1.0, config)
 
 
 @pytest.mark.parametrize('std', [0.0, 0.03])
@@ -98,7 +98,7 @@ def test_backends_give_the_same_labels(compiled_code, seed, dtype):
             scan = backend.build_grid(xyz, CONFIG)
             faces = backend.find_faces(scan, 0.0, CONFIG)
             assert faces.is_face.any()
-            found.append(backend.label_points(scan, faces, surface, LEVEL, config))
+            found.append(backend.label_points(scan, faces, surface, LEVEL, 0.3, config))
         np.testing.assert_array_equal(found[0].label, found[1].label)
         np.testing.assert_allclose(found[0].margin, found[1].margin, atol=1e-9)
         height = scan.xyz[:, 2] - at_points(KNOTS, mean, scan.grid)

@@ -135,14 +135,12 @@ def test_no_relief_is_what_cannot_be_climbed(backend, name, share):
     relief, over = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
     assert relief.is_level
     assert over is candidates
-    assert (relief.at(np.array([0.0, 9.0]), np.array([0.0, 3.0])) == 0.0).all()
 
 
 def test_without_ground_near_the_sensor_there_is_no_relief(backend):
     behind = candidates_on(bank(25, 10.0), RINGS[RINGS > 14.0])
     behind = behind.where(behind.x > 13.0)
-    nothing = behind.where(behind.x > 500.0)
-    for candidates in (behind, nothing):
+    for candidates in (behind, behind.where(behind.x > 500.0)):
         assert backend.find_relief(candidates, NO_FACES, HEIGHT, Config())[0].is_level
 
 
@@ -151,8 +149,7 @@ def test_between_middles_it_is_linear_and_beyond_the_border_constant():
     relief = Relief.of(height)
     np.testing.assert_allclose(heights_of(relief), height, atol=1e-4)
     x, y = MIDDLES[10] + 0.5, MIDDLES[20] + 1.5
-    corners = height[10:12, 20:22]
-    expected = np.array([0.75, 0.25]) @ corners @ np.array([0.25, 0.75])
+    expected = np.array([0.75, 0.25]) @ height[10:12, 20:22] @ np.array([0.25, 0.75])
     found = relief.at(np.array([x, -500.0, 80.0]), np.array([y, MIDDLES[0], 70.0]))
     np.testing.assert_allclose(found, [expected, height[0, 0], height[-1, -1]], atol=1e-4)
     knots = np.array([2.0, 10.0])

@@ -47,13 +47,19 @@ def test_what_is_a_face(backend, name):
 
 def test_returns_above_one_place_have_no_direction(backend):
     """The torture campaign's: their scatter is rounding, whose direction differed by backend."""
-    rng = np.random.default_rng(0)
-    for x, place in rng.uniform(0.01, 0.49, (fewer(60, 20), 2)):
-        y = rng.uniform(0.01, 0.49, 60)
+    for x, place, *y in np.random.default_rng(0).uniform(0.01, 0.49, (fewer(60, 20), 62)):
         foot = np.column_stack([np.full(60, x), y, np.linspace(0.0, 0.09, 60)])
         above = [[x, place, z] for z in (0.5, 0.52, 0.55)]
         is_face, is_occluded, _ = faces_of(backend, CORNER + np.vstack([foot, above]))
         assert is_face.all() and not is_occluded.any()
+
+
+def test_a_face_below_an_edge_shows_no_ground(backend):
+    face = CORNER + PLANES[0.3] - [0.0, 0.0, 1.0]
+    before = face * [0.85, 0.85, 0.0] - [0.0, 0.0, 1.0]
+    for xyz, is_beyond in ((face, True), (np.vstack([before, face]), False)):
+        is_face, is_occluded, _ = faces_of(backend, xyz, max_foot_distance=0.0)
+        assert is_face[-60:].all() and (is_occluded[-60:] == is_beyond).all()
 
 
 @settings(max_examples=fewer(30, 10))

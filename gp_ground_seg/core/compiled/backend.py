@@ -71,7 +71,7 @@ class NumbaBackend:
         """Tiles that show no ground."""
         result = Faces.none(scan.tiles)
         groups = numbers_of(config.faces), numbers_of(config.label)
-        faces_.find_faces(scan.xyz.T, scan.tiles, height, *groups, result)
+        faces_.find_faces(scan._replace(xyz=scan.xyz.T), height, *groups, result)
         return result
 
     def find_relief(
@@ -146,7 +146,13 @@ class NumbaBackend:
         )
 
     def label_points(
-        self, scan: Scan, faces: Faces, surface: GroundSurface, relief: Relief, config: Config
+        self,
+        scan: Scan,
+        faces: Faces,
+        surface: GroundSurface,
+        relief: Relief,
+        height: float,
+        config: Config,
     ) -> Labelled:
         """Height, label and margin of each point."""
         n_points = len(scan.xyz)
@@ -159,7 +165,7 @@ class NumbaBackend:
             relief,
             relief.is_level,
             numbers_of(config.label),
-            depth_of_ground(config.label),
+            depth_of_ground(height, config.label),
             sum_units(n_points),
             lowest_of(surface),
             config.label.rule == 'roughness',

@@ -24,7 +24,6 @@ from gp_ground_seg.core.pipeline.relief import (
     FADED,
     GENTLE,
     MIN_ENTRY,
-    MIN_RAISED,
     MIN_SEEDS,
     MIN_WEIGHT,
     MIN_WIDTH,
@@ -70,10 +69,10 @@ def find_relief(
     Where it is, nothing is set.
     """
     before, behind = reachable(candidates, is_face, height, growth)
-    land, is_known = _land_of(candidates, before, height)
+    land, is_known = _fit_planes(candidates, before, height)
     below, is_known_below = land, np.zeros(_N_SQUARES, np.bool_)
     if behind.any():
-        below, is_known_below = _land_of(candidates, behind, height)
+        below, is_known_below = _fit_planes(candidates, behind, height)
     if max(_highest(land, is_known), _highest(below, is_known_below)) <= FADED:
         return True
     is_behind = np.zeros(_N_SQUARES, np.bool_)
@@ -84,16 +83,6 @@ def find_relief(
     for c in range(len(z)):
         z[c] = candidates.z[c] - height_at(pieces, candidates.x[c], candidates.y[c])
     return False
-
-
-@jit()
-def _land_of(
-    candidates: Candidates, chosen: BoolArray, height: float
-) -> tuple[FloatArray, BoolArray]:
-    """See the plain `_land_of`."""
-    land, is_known, number = _fit_planes(candidates, chosen, height)
-    _leave_out_small(land, is_known, number)
-    return land, is_known
 
 
 @jit()
@@ -174,11 +163,8 @@ def _place(i: int, j: int) -> int:
 @jit()
 def _fit_planes(
     candidates: Candidates, reached: BoolArray, height: float
-) -> tuple[FloatArray, BoolArray, IntArray]:
-    """Heights of the land, which are known, and numbers of candidates, of all squares.
-
-    See the plain `fit_planes`.
-    """
+) -> tuple[FloatArray, BoolArray]:
+    """Heights of the land in all squares, and which are known. See the plain `fit_planes`."""
     x, y, z = candidates.x, candidates.y, candidates.z
     square, number = np.empty(len(x), np.int64), np.zeros(_N_SQUARES, np.int64)
     for c in range(len(x)):
@@ -205,7 +191,7 @@ def _fit_planes(
                 _set_plane(sums[k], plane[k])
                 is_known[k] = True
                 land[k] = height_of(plane[k], middle_of(i), middle_of(j))
-    return land, is_known, number
+    return land, is_known
 
 
 @jit()
@@ -245,29 +231,6 @@ def _sums_around(
     for k in range(column, np.uintp(len(own)) - column):
         around[k] = rows[k - row] + rows[k] + rows[k + row]
     return around.reshape(_N_SQUARES, _N_SUMS)
-
-
-@jit()
-def _leave_out_small(land: FloatArray, is_known: BoolArray, number: IntArray) -> None:
-    """See the plain `leave_out_small`."""
-    is_seen, part = np.zeros(_N_SQUARES, np.bool_), np.empty(_N_SQUARES, np.int64)
-    for start in range(_N_SQUARES):
-        n = stop = 0
-        if is_known[start] and abs(land[start]) > RAISED and not is_seen[start]:
-            part[0], is_seen[start], stop = start, True, 1
-        while n < stop:
-            for step in (-_WIDTH, -1, 1, _WIDTH):
-                k = part[n] + step
-                if is_known[k] and abs(land[k]) > RAISED and not is_seen[k]:
-                    part[stop], is_seen[k] = k, True
-                    stop += 1
-            n += 1
-        n_occupied = 0
-        for n in range(stop):
-            n_occupied += number[part[n]] > 0
-        if n_occupied < MIN_RAISED:
-            for n in range(stop):
-                is_known[part[n]] = False
 
 
 @jit()

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from gp_ground_seg.core.compiled.roughness import level_at, levels_about
-from gp_ground_seg.core.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Tiles
+from gp_ground_seg.core.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Scan, Tiles
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import FacesConfig, LabelConfig
 from gp_ground_seg.core.pipeline.roughness import N_LEVELS, UNKNOWN_LEVEL
@@ -25,6 +25,7 @@ from gp_ground_seg.core.pipeline.vertical_faces import (
     UNKNOWN,
     face_height,
     is_base_occluded,
+    is_beyond_edge,
     is_examined,
     is_vertical,
     scatter_square,
@@ -44,16 +45,15 @@ _TO_UNITS = 1.5 * 2.0**52 / UNITS_PER_METRE
 
 @jit(entry=True)
 def find_faces(
-    columns: PointArray,
-    tiles: Tiles,
-    height: float,
-    config: FacesConfig,
-    label: LabelConfig,
-    faces: Faces,
+    scan: Scan, height: float, config: FacesConfig, label: LabelConfig, faces: Faces
 ) -> None:
-    """Find the tiles of points (3, N) that show no ground, into `faces`, which has none yet."""
+    """Find the tiles of a scan that show no ground, into `faces`, which has none yet.
+
+    Points are (3, N).
+    """
+    tiles, candidates = scan.tiles, scan.candidates
     tall, tile_to_row = _select_tall(tiles, height, label)
-    sums = _sum_returns(columns, tiles, tall, config.cell_size, label, tile_to_row)
+    sums = _sum_returns(scan.xyz, tiles, tall, config.cell_size, label, tile_to_row)
     square = np.empty(len(tall))
     for k in range(len(tall)):
         low, high = sums[2 * k], sums[2 * k + 1]
@@ -65,6 +65,13 @@ def find_faces(
         faces.has_occluded_base[np.uintp(tall[k])] = is_occluded
         square[k] = UNKNOWN if is_face else scatter_square(low, high)
     _mark_scattered(tiles, tall, square, height, label, faces)
+    for m in range(len(candidates.offsets) - 1):
+        before = 0.0
+        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            r, t = candidates.r[c], candidates.tile[c]
+            if is_beyond_edge(r - before, r, candidates.z[c] + height, label):
+                faces.has_occluded_base[t] = faces.is_face[t]
+            before = r
 
 
 @jit()

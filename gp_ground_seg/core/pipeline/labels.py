@@ -51,27 +51,28 @@ VOTE_UNITS = 2.0**12
 
 
 def label_points(
-    scan: Scan, faces: Faces, surface: GroundSurface, relief: Relief, config: Config
+    scan: Scan, faces: Faces, surface: GroundSurface, relief: Relief, height: float, config: Config
 ) -> Labelled:
     """Label points by their height over the surface (paper, Algorithm 2, line 14).
 
     A point within the paper's tolerance is ground; above it, the roughness of the ground about it
-    decides (see `ground_band`); and below the surface there is no obstacle. Of a vertical face
+    decides (see `ground_band`); below the surface there is no obstacle, down to `depth_of_ground`
+    for a sensor at a `height` [m]. Of a vertical face
     only returns near its lowest one are ground; none are where its base is occluded. Then the
     returns near the surface vote (see `mean_votes`).
     """
     grid, tiles, label = scan.grid, scan.tiles, config.label
     z = scan.xyz[:, 2].astype(np.float64)
     # NaN outside, as is what follows; tiles there are negative, which index something.
-    height = over_relief(scan, z, relief) - at_points(surface.knots, surface.mean, grid)
+    over = over_relief(scan, z, relief) - at_points(surface.knots, surface.mean, grid)
     tile = as_index(tiles.tile)
     in_face = faces.is_face[tile] & grid.inside
     roughness, band = np.full((2, len(tiles.place) + 1), [[0.0], [label.ground_tolerance]])
     if label.rule == 'roughness':
         units = sum_units(len(z))
-        roughness = ground_roughness(tiles, _near_sums(height, tiles, in_face, units), units)
+        roughness = ground_roughness(tiles, _near_sums(over, tiles, in_face, units), units)
         band = ground_band(roughness, label)
-    margin: FloatArray = band_margin(height, band[tile], depth_of_ground(label))
+    margin: FloatArray = band_margin(over, band[tile], depth_of_ground(height, label))
     of_face = np.flatnonzero(in_face)
     margin[of_face] = face_margin(
         margin[of_face],
@@ -80,19 +81,22 @@ def label_points(
         foot_of_face(roughness, label)[tile[of_face]],
     )
     if label.rule == 'roughness':
-        voters = np.flatnonzero(is_near(height))
+        voters = np.flatnonzero(is_near(over))
         heights = z[voters] - lowest_of(surface)
         voters, means = mean_votes(voters, heights, margin, tiles, label.ground_tolerance)
         margin[voters] = margin_after_vote(margin[voters], means)
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
-    return Labelled(result, height, margin)
+    return Labelled(result, over, margin)
 
 
-def depth_of_ground(label: LabelConfig) -> float:
-    """Depth below the surface down to which a return is ground [m]."""
-    by_roughness = label.rule == 'roughness'
-    return label.obstacle_max_height if by_roughness else label.ground_tolerance
+def depth_of_ground(height: float, label: LabelConfig) -> float:
+    """Depth below the surface down to which a return is ground [m].
+
+    A sensor at a `height` below 1 m sees tops of what stands on lower land behind an edge.
+    """
+    by_roughness = min(height, 1.0) * label.obstacle_max_height
+    return by_roughness if label.rule == 'roughness' else label.ground_tolerance
 
 
 @shared

@@ -61,10 +61,9 @@ RIDGE = 0.5
 """Variance that is added to those of x and y [m^2]: planes through few places are more level."""
 MIN_WEIGHT = 1.5
 """Least weight of a plane, where a square with candidates counts one."""
-RAISED, MIN_ENTRY, MIN_RAISED = 0.3, 1.5, 9
+RAISED, MIN_ENTRY = 0.3, 1.5
 """Height over which land is raised [m]; width over which steps must lead up to it [m]: few lead to
-a car; and squares side by side with candidates in them that it, or a hollow, must have: more than
-those of a truck."""
+a car."""
 FADED, FADE_WIDTH = 0.15, 0.3
 """Height of the land up to which the relief is level, and over which it then grows to it [m]."""
 
@@ -122,7 +121,7 @@ def find_relief(
     is_seed = allowed & (candidates.r < growth.seed_range)
     is_seed &= np.abs(over_plane.z) < growth.seed_height_tolerance
     sides = [over_plane.where(side) for side in reachable(over_plane, allowed, is_seed)]
-    lands = [_land_of(side) for side in sides if len(side.r)]
+    lands = [fit_planes(side.x, side.y, side.z) for side in sides if len(side.r)]
     if not any((np.abs(land[is_known]) > FADED).any() for land, is_known in lands):
         return Relief.level(), candidates
     relief = Relief.of(faded(filled(*lands[0])))
@@ -131,13 +130,6 @@ def find_relief(
         is_behind = _is_behind(sides, lands)[..., None]
         relief = Relief(np.where(is_behind, behind.pieces, relief.pieces))
     return relief, candidates._replace(z=candidates.z - relief.at(candidates.x, candidates.y))
-
-
-def _land_of(candidates: Candidates) -> tuple[FloatArray, BoolArray]:
-    """Height of the land in each square by candidates on it, and where it is known."""
-    land, is_known, is_occupied = fit_planes(candidates.x, candidates.y, candidates.z)
-    leave_out_small(land, is_known, is_occupied)
-    return land, is_known
 
 
 def _is_behind(sides: list[Candidates], lands: list[tuple[FloatArray, BoolArray]]) -> BoolArray:
@@ -335,21 +327,18 @@ def can_step(distance: Values, rise: Values, most: float) -> Values:
     return np.abs(rise) <= np.minimum(MAX_SLOPE * distance + STEP_TOLERANCE, most)
 
 
-def fit_planes(
-    x: FloatArray, y: FloatArray, z: FloatArray
-) -> tuple[FloatArray, BoolArray, BoolArray]:
+def fit_planes(x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Height of the land in the middle of each square, by the places (P,) in and around it.
 
     The places in a square share a weight of one, so that those near the sensor are not all. Then
     each counts less with its distance to the plane of its own square.
 
-    Returns the heights [m], which of them are determined, and which squares have places, three
-    (N_SIDES, N_SIDES); heights that are not determined are arbitrary.
+    Returns the heights [m] and which of them are determined, two (N_SIDES, N_SIDES); heights that
+    are not determined are arbitrary.
     """
     i, j = square_of(x).astype(np.int64), square_of(y).astype(np.int64)
     square, shape = i * N_SIDES + j, (N_SIDES, N_SIDES)
-    in_square = np.bincount(square, minlength=N_SIDES * N_SIDES)
-    number = in_square[square]
+    number = np.bincount(square)[square]
     weight, products = 1.0 / number, (np.ones_like(x), x, y, z, x * x, x * y, y * y, x * z, y * z)
     for _ in range(N_ROUNDS):
         sums = (np.bincount(square, weight * p, N_SIDES * N_SIDES) for p in products)
@@ -360,7 +349,7 @@ def fit_planes(
     middle = middle_of(np.arange(N_SIDES))
     land: FloatArray = height_of(plane, middle[:, None], middle)
     is_known: BoolArray = around[0] >= MIN_WEIGHT
-    return land, is_known, in_square.reshape(shape) > 0
+    return land, is_known
 
 
 def three_by_three(table: npt.NDArray[Any]) -> FloatArray:
@@ -370,17 +359,6 @@ def three_by_three(table: npt.NDArray[Any]) -> FloatArray:
     rows = padded[:-2] + padded[1:-1] + padded[2:]
     result: FloatArray = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
     return result
-
-
-def leave_out_small(land: FloatArray, is_known: BoolArray, is_occupied: BoolArray) -> None:
-    """Set heights to be unknown where few squares side by side are raised or lowered."""
-    from scipy.ndimage import label
-
-    part, n_parts = label(is_known & (np.abs(land) > RAISED))
-    number = np.bincount(part.ravel(), is_occupied.ravel(), minlength=n_parts + 1)
-    is_small = number < MIN_RAISED
-    is_small[0] = False
-    is_known &= ~is_small[part]
 
 
 def filled(land: FloatArray, is_known: BoolArray) -> FloatArray:

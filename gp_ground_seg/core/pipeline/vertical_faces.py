@@ -26,6 +26,7 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, FacesConfig, LabelConfig
+from gp_ground_seg.core.pipeline.relief import longest_gap
 from gp_ground_seg.core.pipeline.roughness import (
     N_LEVELS,
     ROUGHNESS,
@@ -55,7 +56,7 @@ UNKNOWN = -1.0
 """Square of a scatter that is not known [m^2]."""
 SCATTERED = Window(2, 0.75, 4)
 """Window of the raised tiles among which many may scatter: of 6 m, for tiles of 0.5 m."""
-SMOOTH, TIMES_OWN, OWN_SHARE = 0.025, 4.0, 0.75
+SMOOTH, TIMES_OWN, OWN_SHARE = 0.025, 4.5, 0.75
 """Scatter up to which land is smooth [m]: terrain of KITTI has 0.003 to 0.02, beds and stairs 0.03
 to 0.06; what it may be as a multiple of that of the own level, of which this share is smoother."""
 SAMPLED = 2
@@ -106,6 +107,12 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     square = np.where(result.is_face[tall], UNKNOWN, scatter_square(foot, rest))
     rough = tall[_scattered(tiles.place[tall], n_sides, square, extent, over, label)]
     result.is_face[rough] = result.has_occluded_base[rough] = True
+    candidates = scan.candidates
+    is_next = np.diff(candidates.segment, prepend=-1) == 0
+    gap = candidates.r - np.where(is_next, np.roll(candidates.r, 1), 0.0)
+    is_beyond = is_beyond_edge(gap, candidates.r, candidates.z + height, label)
+    beyond = candidates.tile[is_beyond]
+    result.has_occluded_base[beyond] = result.is_face[beyond]
     return result
 
 
@@ -142,6 +149,15 @@ def is_examined(extent: Values, over: Values, place: Values, label: LabelConfig)
     face = face_height(label)
     is_sample = (place % SAMPLED == 0) & (over > -0.5 * face)
     return (extent > face) | (over > 0.5 * face) | is_sample
+
+
+@shared
+def is_beyond_edge(gap: Values, r: Values, over: Values, label: LabelConfig) -> Values:
+    """Whether no ground is seen before a candidate, which is `over` the own level [m], and lower.
+
+    A face there is of what stands on lower land behind an edge, which hides its base.
+    """
+    return (gap > longest_gap(r)) & (over < -face_height(label))
 
 
 @shared
