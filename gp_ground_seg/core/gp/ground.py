@@ -134,7 +134,7 @@ def fits(
     residual = z - height
     limit = choose(residual > 0.0, growth.max_standardised_residual, growth.max_standardised_depth)
     is_near = residual * residual <= limit * limit * (variance + noise)
-    return (variance <= growth.max_std * growth.max_std) & is_near
+    return (np.minimum(variance, residual * residual) <= growth.max_std * growth.max_std) & is_near
 
 
 @shared
