@@ -42,7 +42,7 @@ def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
     assert (a is None) == (b is None)
     if a is not None:
         np.testing.assert_allclose(a, b, atol=1e-9)
-        assert 0.0 < a.support <= 1.0 and 0.0 < a.near_support <= 1.0
+        assert 0.0 < a.support <= 1.0
         assert a.n_support <= N_SECTORS * ground_plane.N_RINGS
 
 

@@ -27,8 +27,8 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     crossed_at,
     described,
     distance,
-    fit_cells,
     levelness,
+    own_level,
     refutation_by,
     support_by,
     tolerance_at,
@@ -38,7 +38,7 @@ from gp_ground_seg.core.pipeline.ground_plane import (
 
 @jit(entry=True)
 def _fit_cells(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
-    return fit_cells(cells, max_slope)
+    return own_level(cells, max_slope)
 
 
 def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
