@@ -30,8 +30,9 @@ def random_candidates(seed, n_segments, n_bins, share):
     z += np.round(rng.normal(0.0, 0.1, offsets[-1]), 1)
     own_bin = np.zeros(offsets[-1], dtype=np.int64)
     density, tile = np.zeros(offsets[-1]), np.zeros(offsets[-1], dtype=np.int32)
-    r = np.concatenate(r)
-    return Candidates(r, z, own_bin, density, offsets, tile, np.zeros_like(r), np.zeros_like(r))
+    r, azimuth = np.concatenate(r), np.repeat(np.arange(n_segments) * 2 * np.pi / n_segments, n)
+    x, y = r * np.cos(azimuth), r * np.sin(azimuth)
+    return Candidates(r, z, own_bin, density, offsets, tile, x, y)
 
 
 @settings(max_examples=fewer(20, 10))
@@ -55,7 +56,8 @@ def test_floor_at_the_foot_of_a_wall_lies_on_the_plane_of_the_floor():
     z = np.where(r < 5.0, -1.0, -0.5)
     z[(r == 5.0) & (m % 5 == 0)] = -1.0
     zero, offsets = np.zeros(len(r), np.int32), np.arange(181) * 8
-    candidates = Candidates(r, z, zero.astype(np.int64), 1.0 + zero, offsets, zero, r, z)
+    x, y = r * np.cos(m * np.pi / 90.0), r * np.sin(m * np.pi / 90.0)
+    candidates = Candidates(r, z, zero.astype(np.int64), 1.0 + zero, offsets, zero, x, y)
     cells = ground_plane.lowest_points(candidates)
     at_wall = cells.z == -0.5
     assert at_wall.sum() == 36 and (cells.lowest_z == -1.0).all()

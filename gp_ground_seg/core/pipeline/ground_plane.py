@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -101,16 +100,8 @@ class LowestPoints(NamedTuple):
     is_alone: BoolArray  # (C,) whether there are not `N_TOGETHER`, as where noise is the lowest
 
 
-@lru_cache(maxsize=4)
-def segment_directions(n_segments: int) -> FloatArray:
-    """Cosine and sine of the azimuth of the middle of each segment, (2, n_segments)."""
-    azimuth = (np.arange(n_segments) + 0.5) * (2.0 * np.pi / n_segments) - np.pi
-    table = np.stack([np.cos(azimuth), np.sin(azimuth)])
-    table.setflags(write=False)
-    return table
-
-
-DIRECTIONS = np.ascontiguousarray(segment_directions(N_SECTORS).T)
+AZIMUTHS = (np.arange(N_SECTORS) + 0.5) * (2.0 * np.pi / N_SECTORS)
+DIRECTIONS = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
 """Cosine and sine of each sector, (N_SECTORS, 2)."""
 
 
@@ -118,15 +109,13 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     """Lowest ground candidate of each cell, in sectors by rings.
 
     It is the lowest that has `N_TOGETHER` - 1 more within its tolerance above it; where there is
-    none, the lowest. Of equally low ones the nearest comes first, then that of the first segment,
-    so that the order of the points does not matter.
+    none, the lowest. Of equally low ones the first candidate comes first.
     """
-    r, z, segment, n_segments = *candidates[:2], candidates.segment, candidates.n_segments
+    r, z, n_segments = candidates.r, candidates.z, candidates.n_segments
     near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
     ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
-    cell = (segment[near] * N_SECTORS // n_segments) * N_RINGS + ring
-    # Equally low and near ones stay in order of their segments.
-    order = np.lexsort((r[near], z[near], cell))
+    cell = (candidates.segment[near] * N_SECTORS // n_segments) * N_RINGS + ring
+    order = np.lexsort((z[near], cell))
     near, cell = near[order], cell[order]
     k = N_TOGETHER - 1
     low, high = near[:-k], near[k:]
@@ -134,27 +123,19 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     first, together = np.flatnonzero(is_new(cell)), np.flatnonzero(is_together)
     together = together[is_new(cell[together])]
     lowest, is_alone = near[first], np.ones(len(first), dtype=np.bool_)
-    occupied, lowest_z = cell[first], z[lowest]
-    place = np.searchsorted(occupied, cell[together])
+    place = np.searchsorted(cell[first], cell[together])
     lowest[place], is_alone[place] = near[together], False
-    columns = r[lowest], z[lowest], lowest_z, occupied, is_alone, segment[lowest]
-    return cells_of(n_segments, *columns)
+    return cells_of(candidates, cell[first], lowest, near[first], is_alone)
 
 
 def cells_of(
-    n_segments: int,
-    r: FloatArray,
-    z: FloatArray,
-    lowest_z: FloatArray,
-    cell: IntArray,
-    is_alone: BoolArray,
-    segment: IntArray,
+    candidates: Candidates, cell: IntArray, chosen: IntArray, lowest: IntArray, is_alone: BoolArray
 ) -> LowestPoints:
-    """Lowest points, each in the middle of its segment."""
-    cosine, sine = segment_directions(n_segments)[:, segment]
-    x, y, inverse = r * cosine, r * sine, 1.0 / tolerance_at(r)
+    """Lowest points of cells: the indices of the `chosen` ones, and of the lowest of all."""
+    x, y, z, r = (column[chosen] for column in (candidates.x, candidates.y, candidates.z, candidates.r))
     weight = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
-    return LowestPoints(x, y, z, r, inverse, weight, cell, lowest_z, is_alone)
+    lowest_z = candidates.z[lowest]
+    return LowestPoints(x, y, z, r, 1.0 / tolerance_at(r), weight, cell, lowest_z, is_alone)
 
 
 @shared
