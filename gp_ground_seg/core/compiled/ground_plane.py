@@ -8,8 +8,6 @@ from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray
 from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import (
-    CLEARLY_OFF,
-    LEAST_REACH,
     MAX_Z,
     MIN_CELLS,
     N_CELLS,
@@ -22,12 +20,9 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     Moments,
     Plane,
     cells_of,
-    crossed_at,
     described,
-    distance,
     levelness,
     own_level,
-    refutation_by,
     support_by,
     tolerance_at,
     tukey_weight,
@@ -43,7 +38,8 @@ def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     """Do what `gp_ground_seg.core.pipeline.ground_plane.fit_plane` does, to rounding."""
     indices, is_alone = np.empty((3, N_CELLS), np.int64), np.empty(N_CELLS, np.bool_)
     n = _tabulate(candidates, indices, is_alone)
-    cells = cells_of(candidates, *indices[:, :n], is_alone[:n])
+    cell, chosen, lowest = indices[:, :n]
+    cells = cells_of(candidates, cell, chosen, lowest, is_alone[:n])
     return described(cells, *_fit_cells(cells, max_slope)) if n >= MIN_CELLS else None
 
 
@@ -108,26 +104,6 @@ def _support_of(plane: Plane, cells: LowestPoints) -> float:
     total = 0.0
     for c in range(len(x)):
         total += support_by(x[c], y[c], z[c], inverse[c], weight[c], plane)
-    return total
-
-
-@compiled_form(ground_plane.refutation_of)
-def refutation_of(plane: Plane, cells: LowestPoints) -> float:
-    """Weight of the rays that cross a plane where it should have stopped them."""
-    total, heights = 0.0, np.empty(len(cells.z))
-    is_seen, reach = np.zeros(N_CELLS, np.bool_), np.full(N_SECTORS, LEAST_REACH)
-    for c in range(len(heights)):
-        heights[c] = distance(cells.x[c], cells.y[c], cells.z[c], plane)
-        if abs(heights[c] * cells.inverse[c]) < 1.0:
-            sector = cells.cell[c] // N_RINGS
-            is_seen[cells.cell[c]], reach[sector] = True, max(reach[sector], cells.r[c])
-    for c in range(len(heights)):
-        if heights[c] * cells.inverse[c] < -CLEARLY_OFF and not cells.is_alone[c]:
-            sector = cells.cell[c] // N_RINGS
-            crossing = crossed_at(cells.r[c], heights[c], plane[0])
-            ring = np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
-            if crossing < reach[sector] and not is_seen[sector * N_RINGS + ring]:
-                total += refutation_by(crossing)
     return total
 
 

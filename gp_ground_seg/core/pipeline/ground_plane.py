@@ -74,8 +74,6 @@ N_TRIPLES = 192
 """Planes tried through three cells each."""
 N_LEVEL = 64
 """Level planes tried, at most."""
-LOOSER = 1.1
-"""Largest slope of a refined plane over that of the hypotheses."""
 RESOLUTION = 4096.0
 """Support by a point at `MIDDLE` exactly on a plane; that of each is a whole number, so that sums
 are exact."""
@@ -132,10 +130,10 @@ def cells_of(
     candidates: Candidates, cell: IntArray, chosen: IntArray, lowest: IntArray, is_alone: BoolArray
 ) -> LowestPoints:
     """Lowest points of cells: the indices of the `chosen` ones, and of the lowest of all."""
-    x, y, z, r = (column[chosen] for column in (candidates.x, candidates.y, candidates.z, candidates.r))
+    x, y, z, r = candidates.x[chosen], candidates.y[chosen], candidates.z, candidates.r[chosen]
     weight = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
-    lowest_z = candidates.z[lowest]
-    return LowestPoints(x, y, z, r, 1.0 / tolerance_at(r), weight, cell, lowest_z, is_alone)
+    inverse = 1.0 / tolerance_at(r)
+    return LowestPoints(x, y, z[chosen], r, inverse, weight, cell, z[lowest], is_alone)
 
 
 @shared
@@ -209,19 +207,10 @@ def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     return described(cells, *own_level(cells, max_slope)) if len(cells.z) >= MIN_CELLS else None
 
 
-def _spread(n: int) -> FloatArray:
-    """Return n points evenly spread in the unit cube, (n, 3): the additive recurrence R3.
-
-    Its steps are powers of the root of x^4 = x + 1 (Roberts, 2018).
-    """
-    root = 1.2207440846057596
-    steps = root ** -np.arange(1.0, 4.0)
-    points: FloatArray = (0.5 + np.arange(1, n + 1)[:, None] * steps) % 1.0
-    return points
-
-
-SPREAD = _spread(N_TRIPLES)
-"""Which three cells, as shares of their number, (N_TRIPLES, 3)."""
+STEPS = 1.2207440846057596 ** -np.arange(1.0, 4.0)
+SPREAD = (0.5 + np.arange(1, N_TRIPLES + 1)[:, None] * STEPS) % 1.0
+"""Which three cells, as shares of their number, (N_TRIPLES, 3): evenly spread in the unit cube, by
+the recurrence R3, whose steps are powers of the root of x^4 = x + 1 (Roberts, 2018)."""
 
 
 @shared
@@ -407,6 +396,7 @@ def support_by(
     return np.floor(choose(support > 0.0, support, 0.0))
 
 
+@shared
 def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     """Weight of the rays that cross a plane where it should have stopped them; a whole number.
 
@@ -420,28 +410,15 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     is_on, is_below = np.abs(d) < 1.0, (d < -CLEARLY_OFF) & ~cells.is_alone
     is_seen, reach = np.zeros(N_CELLS, dtype=np.bool_), np.full(N_SECTORS, LEAST_REACH)
     is_seen[cells.cell[is_on]] = True
-    np.maximum.at(reach, sector[is_on], cells.r[is_on])
-    sector = sector[is_below]
-    crossing = crossed_at(cells.r[is_below], height[is_below], plane[0])
+    # The farthest is the last of a sector.
+    reach[sector[is_on]] = np.maximum(cells.r[is_on], LEAST_REACH)
+    sector, crossing = sector[is_below], cells.r[is_below]
+    # A ray below the plane all the way, as that of a ceiling, is taken to cross it where it ends.
+    if plane[0] > 0.0:
+        crossing = crossing * plane[0] / (plane[0] - height[is_below])
     crossed = sector * N_RINGS + np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
     counts = (crossing < reach[sector]) & ~is_seen[crossed]
-    return float(refutation_by(crossing[counts]).sum())
-
-
-@shared
-def crossed_at(r: Values, height: Values, clearance: float) -> Values:
-    """Range where the ray to a point below a plane crosses it, from `clearance` above [m].
-
-    `height` is that of the point, negative. A ray that is below the plane all the way, as that of
-    a ceiling, is taken to cross it where it ends.
-    """
-    return r * clearance / (clearance - height) if clearance > 0.0 else r
-
-
-@shared
-def refutation_by(crossing: Values) -> Values:
-    """Refutation of a plane by a ray that crosses it at a range; a whole number."""
-    return np.floor(REFUTATION * RESOLUTION * nearness(crossing))
+    return float(np.floor(REFUTATION * RESOLUTION * nearness(crossing[counts])).sum())
 
 
 @shared
@@ -453,7 +430,7 @@ def refined(cells: LowestPoints, first: Plane, max_slope: float) -> Plane:
     plane = first
     for _ in range(N_REFINEMENTS):
         plane = solve_plane(weighted_moments(cells, plane), plane)
-    return plane if is_possible(plane, LOOSER * max_slope) else first
+    return plane if is_possible(plane, max_slope) else first
 
 
 Moments = tuple[float, float, float, float, float, float, float, float, float]

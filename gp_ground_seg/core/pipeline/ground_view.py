@@ -26,8 +26,6 @@ more; parts of a scan, up to 60 degrees wide, have fewer, or less than `MIN_COVE
 sectors."""
 MIN_COVERAGE = 0.25
 """Share of the sectors with ground in them from which a scan determines the tilt."""
-MIN_REACH = 5.0
-"""Range that the ground must reach for the same [m]."""
 
 OVERHUNG = 0.75
 """`GroundPlane.overhung` from which a plane may be that of a reflected ceiling."""
@@ -135,8 +133,8 @@ class View(NamedTuple):
     @property
     def tells_tilt(self) -> bool:
         """Whether it is enough ground to tell the tilt."""
-        is_wide = self.plane.coverage >= MIN_COVERAGE and self.plane.reach >= MIN_REACH
-        return self.is_surface and self.is_well_supported and is_wide
+        is_wide = self.plane.coverage >= MIN_COVERAGE
+        return is_wide and self.is_surface and self.is_well_supported
 
     @property
     def can_level(self) -> bool:
