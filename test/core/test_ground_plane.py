@@ -26,8 +26,9 @@ def random_candidates(seed, n_segments, n_bins, share):
     z += np.round(rng.normal(0.0, 0.1, offsets[-1]), 1)
     own_bin = np.zeros(offsets[-1], dtype=np.int64)
     density, tile = np.zeros(offsets[-1]), np.zeros(offsets[-1], dtype=np.int32)
-    r = np.concatenate(r)
-    return Candidates(r, z, own_bin, density, offsets, tile, np.zeros_like(r), np.zeros_like(r))
+    azimuth = np.repeat(np.arange(n_segments) * 2 * np.pi / n_segments, n)
+    x_y = np.concatenate(r) * (np.cos(azimuth), np.sin(azimuth))
+    return Candidates(np.concatenate(r), z, own_bin, density, offsets, tile, *x_y)
 
 
 @settings(max_examples=fewer(20, 10))
@@ -38,7 +39,7 @@ def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
     assert (a is None) == (b is None)
     if a is not None:
         np.testing.assert_allclose(a, b, atol=1e-9)
-        assert 0.0 < a.support <= 1.0 and 0.0 < a.near_support <= 1.0
+        assert 0.0 < a.support <= 1.0
         assert a.n_support <= N_SECTORS * ground_plane.N_RINGS
 
 
@@ -51,10 +52,10 @@ def test_floor_at_the_foot_of_a_wall_lies_on_the_plane_of_the_floor():
     z = np.where(r < 5.0, -1.0, -0.5)
     z[(r == 5.0) & (m % 5 == 0)] = -1.0
     zero, offsets = np.zeros(len(r), np.int32), np.arange(181) * 8
-    candidates = Candidates(r, z, zero.astype(np.int64), 1.0 + zero, offsets, zero, r, z)
+    x_y = r * (np.cos(m * np.pi / 90.0), np.sin(m * np.pi / 90.0))
+    candidates = Candidates(r, z, zero.astype(np.int64), 1.0 + zero, offsets, zero, *x_y)
     cells = ground_plane.lowest_points(candidates)
-    at_wall = cells.z == -0.5
-    assert at_wall.sum() == 36 and (cells.lowest_z == -1.0).all()
+    assert (cells.z == -0.5).sum() == 36 and (cells.lowest_z == -1.0).all()
     for backend in BACKENDS:
         plane = backend.fit_plane(candidates, 0.5)
         assert plane.height == pytest.approx(1.0, abs=1e-6)
@@ -67,13 +68,9 @@ def test_backends_agree_on_the_score_of_a_plane(seed, share):
     rng = np.random.default_rng(seed)
     cells = ground_plane.lowest_points(random_candidates(seed, 60, 30, share))
     planes = np.column_stack([rng.uniform(-1.0, 2.5, 20), *rng.normal(0.0, 0.05, (2, 20))])
-    supports = ground_plane.supports_of(planes, cells)
-    np.testing.assert_allclose(compiled.supports_of(planes, cells), supports, rtol=1e-12)
-    refutations, theirs = (
-        [module.refutation_of(tuple(plane), cells) for plane in planes.tolist()]
-        for module in (ground_plane, compiled)
-    )
-    assert theirs == refutations
+    supports, theirs = (module.supports_of(planes, cells) for module in (ground_plane, compiled))
+    np.testing.assert_allclose(theirs, supports, rtol=1e-12)
+    refutations = [ground_plane.refutation_of(tuple(plane), cells) for plane in planes.tolist()]
     # The plane with the best score is found without the refutation of each.
     scores = np.square(supports) / np.maximum(np.add(supports, refutations), 1.0)
     best, score, support = ground_plane.best_of(planes, supports, cells, 0.0)
@@ -88,9 +85,8 @@ def test_backends_agree_on_the_score_of_a_plane(seed, share):
 
 @pytest.mark.parametrize('backend', BACKENDS, ids=lambda b: b.name)
 def test_no_plane(backend):
-    few = random_candidates(0, 1, 40, 1.0)
-    few = few.first(MIN_CELLS - 1)._replace(offsets=np.array([0, MIN_CELLS - 1]))
-    assert backend.fit_plane(few, 0.5) is None
+    few = random_candidates(0, 1, 40, 1.0).first(MIN_CELLS - 1)
+    assert backend.fit_plane(few._replace(offsets=np.array([0, MIN_CELLS - 1])), 0.5) is None
     above = random_candidates(1, 90, 20, 1.0)
     assert backend.fit_plane(above, 0.5) is not None
     # Nothing lies where the ground may be.

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray
 from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import (
-    CLEARLY_OFF,
-    LEAST_REACH,
     MAX_Z,
     MIN_CELLS,
     N_CELLS,
@@ -24,12 +20,9 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     Moments,
     Plane,
     cells_of,
-    crossed_at,
     described,
-    distance,
-    fit_cells,
     levelness,
-    refutation_by,
+    own_level,
     support_by,
     tolerance_at,
     tukey_weight,
@@ -38,83 +31,58 @@ from gp_ground_seg.core.pipeline.ground_plane import (
 
 @jit(entry=True)
 def _fit_cells(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
-    return fit_cells(cells, max_slope)
+    return own_level(cells, max_slope)
 
 
 def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     """Do what `gp_ground_seg.core.pipeline.ground_plane.fit_plane` does, to rounding."""
-    r, z, lowest_z = np.empty((3, N_CELLS))
-    number, segment = np.empty((2, N_CELLS), dtype=np.int64)
-    columns: tuple[Any, ...] = r, z, lowest_z, number, np.empty(N_CELLS, np.bool_), segment
-    n = _tabulate(candidates, *columns)
-    cells = cells_of(candidates.n_segments, *(column[:n] for column in columns))
+    indices, is_alone = np.empty((3, N_CELLS), np.int64), np.empty(N_CELLS, np.bool_)
+    n = _tabulate(candidates, indices, is_alone)
+    cell, chosen, lowest = indices[:, :n]
+    cells = cells_of(candidates, cell, chosen, lowest, is_alone[:n])
     return described(cells, *_fit_cells(cells, max_slope)) if n >= MIN_CELLS else None
 
 
 @jit(entry=True)
-def _tabulate(
-    candidates: Candidates,
-    low_r: FloatArray,
-    low_z: FloatArray,
-    lowest_z: FloatArray,
-    number: IntArray,
-    is_alone: BoolArray,
-    segment: IntArray,
-) -> int:
-    """Set the columns that `cells_of` takes; return the number of cells."""
+def _tabulate(candidates: Candidates, indices: IntArray, is_alone: BoolArray) -> int:
+    """Set what `cells_of` takes; return the number of cells."""
     offsets, r, z = candidates.offsets, candidates.r, candidates.z
     n_segments = len(offsets) - 1
-    cell_of, starts = np.empty(len(r), np.int64), np.zeros(N_CELLS + 1, np.int64)
+    cell_of, starts = np.full(len(r), -1), np.zeros(N_CELLS + 1, np.int64)
     for m in range(n_segments):
         first = (m * N_SECTORS // n_segments) * N_RINGS
         for c in range(offsets[m], offsets[m + 1]):
-            cell_of[c] = -1
             if RING_EDGES[0] <= r[c] < RING_EDGES[N_RINGS] and abs(z[c]) < MAX_Z:
                 cell_of[c] = first + np.searchsorted(RING_EDGES, r[c], side='right') - 1
                 starts[cell_of[c] + 1] += 1
-    for cell in range(N_CELLS):
-        starts[cell + 1] += starts[cell]
-    # Candidates cell by cell, in order of their segments.
-    n, ends, home = starts[N_CELLS], starts[:N_CELLS].copy(), np.empty(starts[N_CELLS], np.int64)
-    near_r, near_z = np.empty(n), np.empty(n)
-    for m in range(n_segments):
-        for c in range(offsets[m], offsets[m + 1]):
-            if cell_of[c] >= 0:
-                k = ends[cell_of[c]]
-                near_r[k], near_z[k], home[k] = r[c], z[c], m
-                ends[cell_of[c]] += 1
+    starts = np.cumsum(starts)
+    # Candidates cell by cell, from low to high: few in each.
+    ends, members = starts[:N_CELLS].copy(), np.empty(starts[N_CELLS], np.int64)
+    for c in range(len(r)):
+        cell = cell_of[c]
+        if cell >= 0:
+            place = ends[cell]
+            while place > starts[cell] and z[members[place - 1]] > z[c]:
+                members[place] = members[place - 1]
+                place -= 1
+            members[place] = c
+            ends[cell] += 1
     n = 0
     for cell in range(N_CELLS):
         if starts[cell] < ends[cell]:
-            first, end = starts[cell], ends[cell]
-            _sort(near_r, near_z, home, first, end)
-            k = _lowest_together(near_r, near_z, first, end)
-            is_alone[n], k, lowest_z[n], number[n] = k < 0, max(k, first), near_z[first], cell
-            low_r[n], low_z[n], segment[n] = near_r[k], near_z[k], home[k]
+            own = members[starts[cell] : ends[cell]]
+            k = _lowest_together(r, z, own)
+            indices[0, n], indices[1, n], indices[2, n] = cell, own[max(k, 0)], own[0]
+            is_alone[n] = k < 0
             n += 1
     return n
 
 
 @jit()
-def _sort(r: FloatArray, z: FloatArray, home: IntArray, first: int, end: int) -> None:
-    """Sort the candidates from `first` to `end` by height, then by range, in place: few."""
-    start, one = np.uintp(first), np.uintp(1)
-    for k in range(start + one, np.uintp(end)):
-        r_k, z_k, home_k, place = r[k], z[k], home[k], k
-        while place > start:
-            before = place - one
-            if z[before] < z_k or (z[before] == z_k and r[before] <= r_k):
-                break
-            r[place], z[place], home[place] = r[before], z[before], home[before]
-            place = before
-        r[place], z[place], home[place] = r_k, z_k, home_k
-
-
-@jit()
-def _lowest_together(r: FloatArray, z: FloatArray, first: int, end: int) -> int:
-    """Lowest of the sorted ones from `first` to `end` that is not alone, or -1."""
-    for k in range(first, end - N_TOGETHER + 1):
-        if z[k + N_TOGETHER - 1] - z[k] <= tolerance_at(r[k]):
+def _lowest_together(r: FloatArray, z: FloatArray, own: IntArray) -> int:
+    """Place of the lowest of candidates from low to high that is not alone, or -1."""
+    for k in range(len(own) - N_TOGETHER + 1):
+        if z[own[k + N_TOGETHER - 1]] - z[own[k]] <= tolerance_at(r[own[k]]):
             return k
     return -1
 
@@ -136,26 +104,6 @@ def _support_of(plane: Plane, cells: LowestPoints) -> float:
     total = 0.0
     for c in range(len(x)):
         total += support_by(x[c], y[c], z[c], inverse[c], weight[c], plane)
-    return total
-
-
-@compiled_form(ground_plane.refutation_of)
-def refutation_of(plane: Plane, cells: LowestPoints) -> float:
-    """Weight of the rays that cross a plane where it should have stopped them."""
-    total, heights = 0.0, np.empty(len(cells.z))
-    is_seen, reach = np.zeros(N_CELLS, np.bool_), np.full(N_SECTORS, LEAST_REACH)
-    for c in range(len(heights)):
-        heights[c] = distance(cells.x[c], cells.y[c], cells.z[c], plane)
-        if abs(heights[c] * cells.inverse[c]) < 1.0:
-            sector = cells.cell[c] // N_RINGS
-            is_seen[cells.cell[c]], reach[sector] = True, max(reach[sector], cells.r[c])
-    for c in range(len(heights)):
-        if heights[c] * cells.inverse[c] < -CLEARLY_OFF and not cells.is_alone[c]:
-            sector = cells.cell[c] // N_RINGS
-            crossing = crossed_at(cells.r[c], heights[c], plane[0])
-            ring = np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
-            if crossing < reach[sector] and not is_seen[sector * N_RINGS + ring]:
-                total += refutation_by(crossing)
     return total
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,27 +40,25 @@ ground may lie above it."""
 CLEARLY_OFF = 2.0
 """Distance from a plane, in tolerances, from which a point may be evidence against it."""
 MIDDLE = 4.0
-"""Range of the points with the most weight [m]: nearer ones may be the robot's own body, and
-farther ones another level than the one that it stands on."""
+"""Range of the points with the most weight [m]: nearer ones may be the robot's own body."""
 LEAST_REACH = 1.5
 """Range to which rays may not cross the ground in any direction [m]: edges of a jetty may be that
 near."""
 REFUTATION = 8.0
 """Weight of a ray that crosses the plane over that of a point on it at `MIDDLE`."""
-APART, PARALLEL = 0.3, 0.06
-"""Distance of two levels, at least [m], and difference of their slopes, at most."""
-OTHER_SHARE = 0.2
-"""Score of another level over the best one from which it counts, and may carry the robot: of the
-top of a dock only the nearest rings are seen."""
-CLEAN = 0.5
-"""Share of the support in all evidence from which a level is not refuted."""
-TIGHT = 0.8
-"""Support of a level over the weights of all points within the tolerance of it: two thirds if
-their heights are any within it."""
-ASIDE = 0.6
-"""Length of the mean of the directions in which a level is seen, from which it lies on one side of
-the robot: it is 0.64 of what fills a half-plane. The mean direction of all that is seen is taken
-off, for sensors that do not look all around."""
+APART = 0.3
+"""Distance of two levels, at least [m]."""
+OTHER_SHARE = 0.05
+"""Score of another level, by points off the best one, over that of the best one from which it
+counts: little is seen of a path between platforms, or of the top of a dock."""
+CLEAN, TIGHT = 0.4, 0.9
+"""Share of the support in all evidence, and support over the weights of all points within the
+tolerance, from which another level may be the own one: desks and cars are of many heights."""
+OWN = 0.3
+"""`asideness` of another level, over that of the best one, below which it is the own one: 0.00 to
+0.27 on paths and docks."""
+STRAY = 0.05
+"""Share of the points of a level that may lie farther in a direction than it reaches."""
 LEVEL_SHARE, STRAIGHT = 0.8, 0.1
 """Score of the best level plane, over that of one that is tilted by less than `STRAIGHT` [rad],
 from which the tilt explains nothing: shelves on one side and floor on the other."""
@@ -77,8 +74,6 @@ N_TRIPLES = 192
 """Planes tried through three cells each."""
 N_LEVEL = 64
 """Level planes tried, at most."""
-LOOSER = 1.1
-"""Largest slope of a refined plane over that of the hypotheses."""
 RESOLUTION = 4096.0
 """Support by a point at `MIDDLE` exactly on a plane; that of each is a whole number, so that sums
 are exact."""
@@ -103,28 +98,22 @@ class LowestPoints(NamedTuple):
     is_alone: BoolArray  # (C,) whether there are not `N_TOGETHER`, as where noise is the lowest
 
 
-@lru_cache(maxsize=4)
-def segment_directions(n_segments: int) -> FloatArray:
-    """Cosine and sine of the azimuth of the middle of each segment, (2, n_segments)."""
-    azimuth = (np.arange(n_segments) + 0.5) * (2.0 * np.pi / n_segments) - np.pi
-    table = np.stack([np.cos(azimuth), np.sin(azimuth)])
-    table.setflags(write=False)
-    return table
+AZIMUTHS = (np.arange(N_SECTORS) + 0.5) * (2.0 * np.pi / N_SECTORS)
+DIRECTIONS = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
+"""Cosine and sine of each sector, (N_SECTORS, 2)."""
 
 
 def lowest_points(candidates: Candidates) -> LowestPoints:
     """Lowest ground candidate of each cell, in sectors by rings.
 
     It is the lowest that has `N_TOGETHER` - 1 more within its tolerance above it; where there is
-    none, the lowest. Of equally low ones the nearest comes first, then that of the first segment,
-    so that the order of the points does not matter.
+    none, the lowest. Of equally low ones the first candidate comes first.
     """
-    r, z, segment, n_segments = *candidates[:2], candidates.segment, candidates.n_segments
+    r, z, n_segments = candidates.r, candidates.z, candidates.n_segments
     near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
     ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
-    cell = (segment[near] * N_SECTORS // n_segments) * N_RINGS + ring
-    # Equally low and near ones stay in order of their segments.
-    order = np.lexsort((r[near], z[near], cell))
+    cell = (candidates.segment[near] * N_SECTORS // n_segments) * N_RINGS + ring
+    order = np.lexsort((z[near], cell))
     near, cell = near[order], cell[order]
     k = N_TOGETHER - 1
     low, high = near[:-k], near[k:]
@@ -132,27 +121,19 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     first, together = np.flatnonzero(is_new(cell)), np.flatnonzero(is_together)
     together = together[is_new(cell[together])]
     lowest, is_alone = near[first], np.ones(len(first), dtype=np.bool_)
-    occupied, lowest_z = cell[first], z[lowest]
-    place = np.searchsorted(occupied, cell[together])
+    place = np.searchsorted(cell[first], cell[together])
     lowest[place], is_alone[place] = near[together], False
-    columns = r[lowest], z[lowest], lowest_z, occupied, is_alone, segment[lowest]
-    return cells_of(n_segments, *columns)
+    return cells_of(candidates, cell[first], lowest, near[first], is_alone)
 
 
 def cells_of(
-    n_segments: int,
-    r: FloatArray,
-    z: FloatArray,
-    lowest_z: FloatArray,
-    cell: IntArray,
-    is_alone: BoolArray,
-    segment: IntArray,
+    candidates: Candidates, cell: IntArray, chosen: IntArray, lowest: IntArray, is_alone: BoolArray
 ) -> LowestPoints:
-    """Lowest points, each in the middle of its segment."""
-    cosine, sine = segment_directions(n_segments)[:, segment]
-    x, y, inverse = r * cosine, r * sine, 1.0 / tolerance_at(r)
+    """Lowest points of cells: the indices of the `chosen` ones, and of the lowest of all."""
+    x, y, z, r = candidates.x[chosen], candidates.y[chosen], candidates.z, candidates.r[chosen]
     weight = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
-    return LowestPoints(x, y, z, r, inverse, weight, cell, lowest_z, is_alone)
+    inverse = 1.0 / tolerance_at(r)
+    return LowestPoints(x, y, z[chosen], r, inverse, weight, cell, z[lowest], is_alone)
 
 
 @shared
@@ -176,8 +157,8 @@ class GroundPlane(NamedTuple):
     slope_y: float = 0.0  # rise per metre
     # as `height`, for the parallel plane through the middle of the near cells [m]
     near_height: float = 0.0
-    support: float = 0.0  # share of the cells that lie on it
-    near_support: float = 0.0  # the same of their weights
+    # share of the cells that lie on it, or on the other level, if there are more
+    support: float = 0.0
     coverage: float = 0.0  # share of all sectors around the sensor with such a cell
     reach: float = 0.0  # range within which nine of ten of these cells are [m]
     # angle at which the sensor sees nine of ten of these below the plane through it that is
@@ -223,58 +204,59 @@ def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     steepest plane to look for, as rise per metre.
     """
     cells = lowest_points(candidates)
-    return described(cells, *fit_cells(cells, max_slope)) if len(cells.z) >= MIN_CELLS else None
+    return described(cells, *own_level(cells, max_slope)) if len(cells.z) >= MIN_CELLS else None
 
 
-@shared
-def fit_cells(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
-    """Fit a plane to the lowest points; return it, and the height of another level or infinity."""
-    best, other = own_level(cells, max_slope)
-    plane = refined(cells, best)
-    # The refinement may drift off to a plane that cannot be the ground.
-    return plane if is_possible(plane, LOOSER * max_slope) else best, other
-
-
-def _spread(n: int) -> FloatArray:
-    """Return n points evenly spread in the unit cube, (n, 3): the additive recurrence R3.
-
-    Its steps are powers of the root of x^4 = x + 1 (Roberts, 2018).
-    """
-    root = 1.2207440846057596
-    steps = root ** -np.arange(1.0, 4.0)
-    points: FloatArray = (0.5 + np.arange(1, n + 1)[:, None] * steps) % 1.0
-    return points
-
-
-SPREAD = _spread(N_TRIPLES)
-"""Which three cells, as shares of their number, (N_TRIPLES, 3)."""
+STEPS = 1.2207440846057596 ** -np.arange(1.0, 4.0)
+SPREAD = (0.5 + np.arange(1, N_TRIPLES + 1)[:, None] * STEPS) % 1.0
+"""Which three cells, as shares of their number, (N_TRIPLES, 3): evenly spread in the unit cube, by
+the recurrence R3, whose steps are powers of the root of x^4 = x + 1 (Roberts, 2018)."""
 
 
 @shared
 def own_level(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
     """Plane of the level that the robot stands on, and height of another level or infinity.
 
-    It is the plane with the best score, or a parallel one over it that is not refuted and carries
-    the robot: the top of a dock, of which less is seen than of what lies below it.
+    It is the plane with the best score, or a parallel one that is not refuted and goes on to where
+    the robot stands, as the best one does not.
     """
-    planes = hypotheses(cells, max_slope)
+    best, best_score = best_level(hypotheses(cells, max_slope), cells)
+    best = refined(cells, best, max_slope)
+    # Points of the best plane, and those that lie alone, are of no other level.
+    is_left = np.abs(distance(cells.x, cells.y, cells.z, best) * cells.inverse) > 1.0
+    left = chosen(cells, is_left & ~cells.is_alone)
+    others = other_levels(best, left)
+    least = OTHER_SHARE * best_score
+    other, score, support = best_of(others, supports_of(others, left), cells, least)
+    if score == 0.0:
+        return best, math.inf
+    is_on = np.abs(distance(left.x, left.y, left.z, other) * left.inverse) <= 1.0
+    may_be_own = support > TIGHT * RESOLUTION * left.weight[is_on].sum()
+    may_be_own = may_be_own and score > CLEAN * support
+    if may_be_own and asideness(cells, other, best) < OWN * asideness(cells, best, other):
+        return refined(left, other, max_slope), best[0]
+    return best, other[0]
+
+
+@shared
+def best_level(planes: FloatArray, cells: LowestPoints) -> tuple[Plane, float]:
+    """Plane with the best score, and its score: a level one if the tilt explains nothing."""
     supports = supports_of(planes, cells)
-    height, slope_x, slope_y = planes[:, 0], planes[:, 1], planes[:, 2]
     best, score, _ = best_of(planes, supports, cells, 0.0)
     if 0.0 < math.hypot(best[1], best[2]) < STRAIGHT:
-        levels = np.where((slope_x == 0.0) & (slope_y == 0.0), supports, 0.0)
+        levels = np.where((planes[:, 1] == 0.0) & (planes[:, 2] == 0.0), supports, 0.0)
         level, level_score, _ = best_of(planes, levels, cells, LEVEL_SHARE * score)
         if level_score > 0.0:
-            best, score = level, level_score
-    is_other = np.hypot(slope_x - best[1], slope_y - best[2]) < PARALLEL
-    is_other &= (np.abs(height - best[0]) > APART) & (height > min(best[0], 0.0))
-    others, least = np.where(is_other, supports, 0.0), OTHER_SHARE * score
-    higher = np.where(height < best[0], others, 0.0)
-    over, over_score, support = best_of(planes, higher, cells, least)
-    if over_score > CLEAN * support and carries(cells, over, best, support):
-        return over, best[0]
-    other, other_score, _ = best_of(planes, others, cells, least)
-    return best, other[0] if other_score > 0.0 else math.inf
+            return level, level_score
+    return best, score
+
+
+@shared
+def chosen(cells: LowestPoints, mask: BoolArray) -> LowestPoints:
+    """Those of the points that are in a mask (C,)."""
+    x, y, z, r, inverse, weight, cell, lowest_z, is_alone = cells
+    columns = x[mask], y[mask], z[mask], r[mask], inverse[mask], weight[mask]
+    return LowestPoints(*columns, cell[mask], lowest_z[mask], is_alone[mask])
 
 
 @shared
@@ -293,6 +275,23 @@ def hypotheses(cells: LowestPoints, max_slope: float) -> FloatArray:
             planes[n_planes, 0], planes[n_planes, 1], planes[n_planes, 2] = plane
             n_planes += 1
     return planes[:n_planes]
+
+
+@shared
+def other_levels(best: Plane, left: LowestPoints) -> FloatArray:
+    """Planes through some of the points, clearly over or below the best one, (P, 3).
+
+    They are parallel to it, or level if its tilt may come from lying on several levels.
+    """
+    is_level = math.hypot(best[1], best[2]) < STRAIGHT
+    slope_x, slope_y = (0.0, 0.0) if is_level else (best[1], best[2])
+    step = 1 + len(left.z) // N_LEVEL
+    height = -distance(left.x, left.y, left.z, (0.0, slope_x, slope_y))[::step]
+    may_be = (np.abs(height - best[0]) > APART) & (height > min(best[0], 0.0))
+    height = height[may_be & (height <= MAX_HEIGHT)]
+    planes = np.empty((len(height), 3))
+    planes[:, 0], planes[:, 1], planes[:, 2] = height, slope_x, slope_y
+    return planes
 
 
 @shared
@@ -316,33 +315,28 @@ def is_possible(plane: Plane, max_slope: float) -> bool:
 
 
 @shared
-def carries(cells: LowestPoints, over: Plane, best: Plane, support: float) -> bool:
-    """Whether a level over another one is seen nearer than the other, and on all sides.
+def asideness(cells: LowestPoints, own: Plane, other: Plane) -> float:
+    """How little a level goes on to where the robot stands: 0 to 2.
 
-    Its `support` is that of a single level: cars are of many heights, and little of what is within
-    the tolerance of a plane is close to it.
+    It is the share of points of another level that lie in the convex hull of its own and the
+    robot: a path has none between it and the platforms on both sides, and lies between these. 1 is
+    added if the robot is not in the hull of its own points, and nearer to that of the other ones.
     """
-    x = y = seen_x = seen_y = told = told_other = whole = 0.0
-    n_over, n_seen, last, last_told = 0, 0, -1, -1
-    for c in range(len(cells.z)):
-        # Cells come sector by sector, from near to far.
-        sector, r = cells.cell[c] // N_RINGS, cells.r[c]
-        cosine, sine = cells.x[c] / r, cells.y[c] / r
-        if sector != last:
-            n_seen, last = n_seen + 1, sector
-            seen_x, seen_y = seen_x + cosine, seen_y + sine
-        place, inverse = (cells.x[c], cells.y[c], cells.z[c]), cells.inverse[c]
-        is_on = abs(distance(*place, over) * inverse) <= 1.0
-        whole += cells.weight[c] if is_on else 0.0
-        if sector != last_told and (is_on or abs(distance(*place, best) * inverse) <= 1.0):
-            last_told, weight = sector, nearness(r) ** 2
-            if is_on:
-                n_over, x, y, told = n_over + 1, x + cosine, y + sine, told + weight
-            else:
-                told_other += weight
-    if n_over == 0 or told <= told_other or support < TIGHT * RESOLUTION * whole:
-        return False
-    return math.hypot(x / n_over - seen_x / n_seen, y / n_over - seen_y / n_seen) < ASIDE
+    x, y, z, inverse = cells.x, cells.y, cells.z, cells.inverse
+    d = np.abs(distance(x, y, z, own) * inverse)
+    from_other = np.abs(distance(x, y, z, other) * inverse)
+    is_own, is_other = (d <= 1.0) & (d <= from_other), (from_other <= 1.0) & (from_other < d)
+    last = len(x) - 1 - int(STRAY * is_own.sum())
+    last_other = len(x) - 1 - int(STRAY * is_other.sum())
+    weight, depth, other_depth = np.where(is_other, cells.weight, 0.0), math.inf, math.inf
+    whole = weight.sum()
+    for cosine, sine in DIRECTIONS:
+        along = cosine * x + sine * y
+        reach = ranked(np.where(is_own, along, -math.inf), last)
+        reach_other = ranked(np.where(is_other, along, -math.inf), last_other)
+        depth, other_depth = min(depth, reach), min(other_depth, reach_other)
+        weight[along > max(reach, 0.0)] = 0.0
+    return float(weight.sum() / max(whole, 1.0)) + (depth < min(other_depth, 0.0))
 
 
 @shared
@@ -402,6 +396,7 @@ def support_by(
     return np.floor(choose(support > 0.0, support, 0.0))
 
 
+@shared
 def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     """Weight of the rays that cross a plane where it should have stopped them; a whole number.
 
@@ -415,36 +410,27 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     is_on, is_below = np.abs(d) < 1.0, (d < -CLEARLY_OFF) & ~cells.is_alone
     is_seen, reach = np.zeros(N_CELLS, dtype=np.bool_), np.full(N_SECTORS, LEAST_REACH)
     is_seen[cells.cell[is_on]] = True
-    np.maximum.at(reach, sector[is_on], cells.r[is_on])
-    sector = sector[is_below]
-    crossing = crossed_at(cells.r[is_below], height[is_below], plane[0])
+    # The farthest is the last of a sector.
+    reach[sector[is_on]] = np.maximum(cells.r[is_on], LEAST_REACH)
+    sector, crossing = sector[is_below], cells.r[is_below]
+    # A ray below the plane all the way, as that of a ceiling, is taken to cross it where it ends.
+    if plane[0] > 0.0:
+        crossing = crossing * plane[0] / (plane[0] - height[is_below])
     crossed = sector * N_RINGS + np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
     counts = (crossing < reach[sector]) & ~is_seen[crossed]
-    return float(refutation_by(crossing[counts]).sum())
+    return float(np.floor(REFUTATION * RESOLUTION * nearness(crossing[counts])).sum())
 
 
 @shared
-def crossed_at(r: Values, height: Values, clearance: float) -> Values:
-    """Range where the ray to a point below a plane crosses it, from `clearance` above [m].
+def refined(cells: LowestPoints, first: Plane, max_slope: float) -> Plane:
+    """Weighted least squares with Tukey's weights of the plane before, again and again.
 
-    `height` is that of the point, negative. A ray that is below the plane all the way, as that of
-    a ceiling, is taken to cross it where it ends.
+    If it drifts off to a plane that cannot be the ground, it is the first.
     """
-    return r * clearance / (clearance - height) if clearance > 0.0 else r
-
-
-@shared
-def refutation_by(crossing: Values) -> Values:
-    """Refutation of a plane by a ray that crosses it at a range; a whole number."""
-    return np.floor(REFUTATION * RESOLUTION * nearness(crossing))
-
-
-@shared
-def refined(cells: LowestPoints, plane: Plane) -> Plane:
-    """Weighted least squares with Tukey's weights of the plane before, again and again."""
+    plane = first
     for _ in range(N_REFINEMENTS):
         plane = solve_plane(weighted_moments(cells, plane), plane)
-    return plane
+    return plane if is_possible(plane, max_slope) else first
 
 
 Moments = tuple[float, float, float, float, float, float, float, float, float]
@@ -499,8 +485,10 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundP
     n = int(np.count_nonzero(is_on))
     if n == 0:
         return None
+    other = distance(cells.x, cells.y, z, (other_height, plane[1], plane[2]))
+    most = max(n, int(np.count_nonzero(np.abs(other * inverse) <= 1.0)))
     d, z, r = d[is_on], z[is_on], cells.r[is_on]
-    few, most, near = n // 10, 9 * n // 10, d[r < NEAR]
+    few, many, near = n // 10, 9 * n // 10, d[r < NEAR]
     drop = np.arctan2(-z, r)
     lift = ranked(near, len(near) // 2) if len(near) >= ENOUGH_NEAR else 0.0
     return GroundPlane(
@@ -508,12 +496,11 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundP
         slope_x=plane[1],
         slope_y=plane[2],
         near_height=height - lift,
-        support=n / len(cells.z),
-        near_support=cells.weight[is_on].sum() / cells.weight.sum(),
+        support=most / len(cells.z),
         coverage=np.count_nonzero(is_new(sector[is_on])) / N_SECTORS,
-        reach=ranked(r, most),
-        depression=ranked(np.arctan2(height - d, r), most),
-        spread=ranked(drop, most) - ranked(drop, few),
+        reach=ranked(r, many),
+        depression=ranked(np.arctan2(height - d, r), many),
+        spread=ranked(drop, many) - ranked(drop, few),
         overhung=np.count_nonzero(is_over) / np.count_nonzero(is_first),
         n_support=n,
         other_height=other_height,
@@ -527,6 +514,7 @@ def is_new(sector: IntArray) -> BoolArray:
     return result
 
 
+@shared
 def ranked(values: Values, rank: int) -> float:
     """Value at `rank` in sorted order."""
     return float(np.partition(values, rank)[rank])

@@ -14,8 +14,6 @@ from gp_ground_seg.core.pipeline.points import angles_of, rotation
 
 MIN_SUPPORT = 0.35
 """Share of the lowest points on the plane from which a scan determines the tilt."""
-MIN_NEAR_SUPPORT = 0.5
-"""Share of their weight that does as well: on a dike most of them lie below it, far away."""
 MIN_CLEARANCE, MIN_SPREAD = 0.05, 0.06
 """Height of the sensor over the plane [m], and spread of the angles of depression of these points
 [rad], for the same: more than one beam."""
@@ -28,8 +26,6 @@ more; parts of a scan, up to 60 degrees wide, have fewer, or less than `MIN_COVE
 sectors."""
 MIN_COVERAGE = 0.25
 """Share of the sectors with ground in them from which a scan determines the tilt."""
-MIN_REACH = 5.0
-"""Range that the ground must reach for the same [m]."""
 
 OVERHUNG = 0.75
 """`GroundPlane.overhung` from which a plane may be that of a reflected ceiling."""
@@ -108,9 +104,7 @@ class View(NamedTuple):
     @property
     def is_well_supported(self) -> bool:
         """Whether enough of the lowest points lie on it to level a scan by it."""
-        plane = self.plane
-        is_wide = plane.support >= MIN_SUPPORT or plane.near_support >= MIN_NEAR_SUPPORT
-        return is_wide or self.is_mirror
+        return self.plane.support >= MIN_SUPPORT or self.is_mirror
 
     @property
     def may_be_image(self) -> bool:
@@ -139,8 +133,8 @@ class View(NamedTuple):
     @property
     def tells_tilt(self) -> bool:
         """Whether it is enough ground to tell the tilt."""
-        is_wide = self.plane.coverage >= MIN_COVERAGE and self.plane.reach >= MIN_REACH
-        return self.is_surface and self.is_well_supported and is_wide
+        is_wide = self.plane.coverage >= MIN_COVERAGE
+        return is_wide and self.is_surface and self.is_well_supported
 
     @property
     def can_level(self) -> bool:
