@@ -257,16 +257,17 @@ class GroundSurface(NamedTuple):
     inlier: BoolArray  # (C,) candidates that the surface rests on
 
 
-def at_points(knots: FloatArray, table: FloatArray, grid: PolarGrid) -> FloatArray:
-    """Value under each point, (N,) float64.
+def at_points(knots: FloatArray, table: FloatArray, grid: PolarGrid) -> PointArray:
+    """Value under each point, (N,), in the precision of the points.
 
     `knots` (K,) are ranges [m], `table` (M, K) the values there, linear between the knots; nearer
     than the first knot it is the first knot's. NaN beyond the last knot.
     """
-    level, slope = linear_pieces(knots, table)
+    number = grid.r.dtype.type
+    level, slope = (factor.astype(number) for factor in linear_pieces(knots, table))
     cell = as_index(grid.cell)  # where it is negative, the value does not matter
     with np.errstate(invalid='ignore'):  # points outside may be infinitely far
-        value: FloatArray = slope[cell] * np.maximum(grid.r, knots[0])
+        value: PointArray = slope[cell] * np.maximum(grid.r, number(knots[0]))
         value += level[cell]
     value[~grid.inside] = np.nan
     return value
@@ -293,7 +294,9 @@ class Labelled(NamedTuple):
 
     # (N,) `Label` of each point; UNKNOWN for points that are not finite
     label: npt.NDArray[np.uint8]
-    height: FloatArray  # (N,) height of each point over the surface [m]; NaN where there is none
+    # (N,) height of each point over the surface [m], in the precision of the points; NaN where
+    # there is none
+    height: PointArray
     # (N,) distance of each point to the nearer edge of the band that is ground [m], negative for
     # obstacles; NaN where there is no surface
-    margin: FloatArray
+    margin: PointArray

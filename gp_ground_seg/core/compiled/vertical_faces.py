@@ -10,11 +10,11 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.core.compiled.roughness import level_at, levels_about
+from gp_ground_seg.core.compiled.roughness import level_at, levels_about, levels_of
 from gp_ground_seg.core.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Tiles
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import FacesConfig, LabelConfig
-from gp_ground_seg.core.pipeline.roughness import N_LEVELS, UNKNOWN_LEVEL
+from gp_ground_seg.core.pipeline.roughness import N_LEVELS, UNKNOWN, UNKNOWN_LEVEL
 from gp_ground_seg.core.pipeline.vertical_faces import (
     OWN_SHARE,
     SCATTER,
@@ -22,7 +22,6 @@ from gp_ground_seg.core.pipeline.vertical_faces import (
     SQUARE_SCATTERS,
     SUMS,
     UNITS_PER_METRE,
-    UNKNOWN,
     face_height,
     is_base_occluded,
     is_examined,
@@ -78,23 +77,17 @@ def _mark_scattered(
 ) -> None:
     """Mark raised tiles about which many scatter. See the plain `_scattered`."""
     n, face = len(tall), face_height(label)
-    place, level = np.empty(n, np.int32), np.empty(n, np.int32)
-    counts, n_own = np.zeros(N_LEVELS, np.int64), 0
+    place, counts = np.empty(n, np.int32), np.zeros(N_LEVELS, np.int64)
+    level, _ = levels_of(square, SQUARE_SCATTERS)
     for k in range(n):
         low, high = tiles.extremes[tall[k], 0], tiles.extremes[tall[k], 1]
         over = np.float64(low) + height
-        place[k], level[k] = tiles.place[tall[k]], UNKNOWN_LEVEL
-        if square[k] == UNKNOWN:
-            continue
-        found = 0
-        for edge in range(len(SQUARE_SCATTERS)):
-            found += np.int64(square[k] >= SQUARE_SCATTERS[edge])
-        if over > 0.5 * face:
-            level[k] = found
-        elif over > -0.5 * face and np.float64(high) - np.float64(low) <= face:
-            counts[found] += 1
-            n_own += 1
-    limit = smooth_up_to(SCATTER[level_at(counts, n_own, OWN_SHARE)])
+        place[k] = tiles.place[tall[k]]
+        if not over > 0.5 * face:
+            if over > -0.5 * face and np.float64(high) - np.float64(low) <= face:
+                counts[level[k]] += level[k] != UNKNOWN_LEVEL
+            level[k] = UNKNOWN_LEVEL
+    limit = smooth_up_to(SCATTER[level_at(counts, counts.sum(), OWN_SHARE)])
     about = levels_about(place, level, int(math.sqrt(len(tiles.at))), SCATTERED, 0)
     for k in range(n):
         over = np.float64(tiles.extremes[tall[k], 0]) + height

@@ -30,6 +30,7 @@ from gp_ground_seg.core.pipeline.roughness import (
     N_LEVELS,
     ROUGHNESS,
     SQUARE_EDGES,
+    UNKNOWN,
     UNKNOWN_LEVEL,
     Window,
     level_at,
@@ -51,8 +52,6 @@ SCATTER = 0.25 * ROUGHNESS
 SQUARE_SCATTERS = SQUARE_EDGES / 16.0
 """Scatter about a plane of each level of `gp_ground_seg.core.pipeline.roughness`, and the squares
 between them [m, m^2]."""
-UNKNOWN = -1.0
-"""Square of a scatter that is not known [m^2]."""
 SCATTERED = Window(2, 0.75, 4)
 """Window of the raised tiles among which many may scatter: of 6 m, for tiles of 0.5 m."""
 SMOOTH, TIMES_OWN, OWN_SHARE = 0.025, 4.0, 0.75
