@@ -74,7 +74,8 @@ def label_points(
     top[at] = top_of_face(roughness[at], tiles.lowest_z[at].astype(np.float64), occluded, label)
     band, top = band.astype(number), top.astype(number)
     depth = number(depth_of_ground(label))
-    margin: PointArray = margin_of(height, scan.xyz[:, 2], band[tile], top[tile], depth)
+    with np.errstate(invalid='ignore'):  # points outside may be infinitely high
+        margin: PointArray = margin_of(height, scan.xyz[:, 2], band[tile], top[tile], depth)
     if by_roughness:
         heights = scan.xyz[near, 2].astype(np.float64) - lowest_of(surface)
         voters, means = mean_votes(near, heights, margin, tiles, label.ground_tolerance)
