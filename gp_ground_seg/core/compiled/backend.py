@@ -27,6 +27,7 @@ from gp_ground_seg.core.frame import (
     PolarGrid,
     Scan,
     Tiles,
+    linear_pieces,
 )
 from gp_ground_seg.core.gp.evidence import ODDS, uses_neighbours_in
 from gp_ground_seg.core.gp.latent import given_log_length_scales
@@ -153,9 +154,10 @@ class NumbaBackend:
             # One type also without a point: another would be compiled, for seconds, when it comes.
             scan._replace(xyz=scan.xyz.T),
             faces,
-            surface,
+            linear_pieces(surface.knots, surface.mean, scan.xyz.dtype),
             relief,
             relief.is_level,
+            surface.knots[0],
             numbers_of(config.label),
             depth_of_ground(config.label),
             sum_units(n_points),

@@ -16,14 +16,12 @@ from gp_ground_seg.core.frame import (
     BoolArray,
     CellArray,
     Faces,
-    GroundSurface,
     IntArray,
     Label,
     Labelled,
     PointArray,
     Scan,
     Tiles,
-    line_between,
 )
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import LabelConfig
@@ -53,9 +51,10 @@ VOTER_FLAG = 2**38
 def label_points(
     scan: Scan,
     faces: Faces,
-    surface: GroundSurface,
+    pieces: PointArray,
     relief: Relief,
     is_level: bool,
+    nearest: float,
     config: LabelConfig,
     depth: float,
     units: float,
@@ -66,14 +65,17 @@ def label_points(
 ) -> None:
     """Height, label and margin of each point, into `result`.
 
-    Here `Scan.xyz` is (3, N). `is_level` says whether the relief is level; `depth`, `units`,
-    `shift` and `lowest` are those of `depth_of_ground`, `sum_units`, `number_shift` and
-    `lowest_of`; `by_roughness` is the rule of the parameters.
+    Here `Scan.xyz` is (3, N). `pieces` are those of `linear_pieces`, from the range `nearest` on;
+    `is_level` says whether the relief is level; `depth`, `units`, `shift` and `lowest` are those
+    of `depth_of_ground`, `sum_units`, `number_shift` and `lowest_of`; `by_roughness` is the rule
+    of the parameters.
     """
     n_tiles, number = len(scan.tiles.place), result.height.dtype.type
     near_tile = np.empty(len(result.label), np.int32)
     sums, roughness = np.zeros(n_tiles + 1, np.int64), np.zeros(n_tiles + 1)
-    _survey(scan, surface, relief, is_level, units, np.int64(1) << shift, near_tile, sums, result)
+    land = relief.pieces.reshape(-1).astype(result.height.dtype)
+    tables = pieces.reshape(-1), land, is_level, number(nearest)
+    _survey(scan, *tables, units, np.int64(1) << shift, near_tile, sums, result)
     if by_roughness:
         for t in range(n_tiles):
             sums[t] = 0 if faces.is_face[t] else sums[t]
@@ -90,27 +92,12 @@ def label_points(
 
 
 @jit()
-def _fit_pieces(surface: GroundSurface, pieces: PointArray) -> None:
-    """Set the line of the surface across each cell, level and slope over range in turn.
-
-    `pieces` have the precision of the points; the last two are for points in no cell, and NaN.
-    """
-    knots, mean = surface.knots, surface.mean
-    n_bins = len(knots) - 1
-    for m in range(len(mean)):
-        for n in range(n_bins):
-            k = 2 * (m * n_bins + n)
-            piece = line_between(knots[n], knots[n + 1], mean[m, n], mean[m, n + 1])
-            pieces[k], pieces[k + 1] = piece
-    pieces[len(pieces) - 2] = pieces[len(pieces) - 1] = math.nan
-
-
-@jit()
 def _survey(
     scan: Scan,
-    surface: GroundSurface,
-    relief: Relief,
+    pieces: PointArray,
+    land: PointArray,
     is_level: bool,
+    nearest: float,
     units: float,
     flag: int,
     near_tile: CellArray,
@@ -123,20 +110,16 @@ def _survey(
     units to the sum, and `flag`.
     """
     x, y, z, height = scan.xyz[0], scan.xyz[1], scan.xyz[2], result.height
-    n_pieces = len(surface.mean) * (len(surface.knots) - 1) + 1
-    pieces, land = np.empty(2 * n_pieces, z.dtype), relief.pieces.reshape(-1).astype(z.dtype)
-    _fit_pieces(surface, pieces)
     u, v, piece = np.zeros(BLOCK, z.dtype), np.zeros(BLOCK, z.dtype), np.zeros(BLOCK, np.int32)
-    terms, nearest = np.empty(BLOCK, np.int64), z.dtype.type(surface.knots[0])
+    terms = np.empty(BLOCK, np.int64)
     for first in range(0, len(z), BLOCK):
         block = slice(first, min(first + BLOCK, len(z)))
         if not is_level:
             find_places(x[block], y[block], u, v, piece)
         r, cell = scan.grid.r[block], scan.grid.cell[block]
         _measure(z[block], r, cell, nearest, pieces, land, u, v, piece, height[block])
-        tile, last = scan.tiles.tile[block], np.int32(len(sums) - 1)
-        _find_near(height[block], tile, last, units, flag, near_tile[block], terms)
-        _add(near_tile[block], terms, sums)
+        tile = scan.tiles.tile[block]
+        _add_squares(height[block], tile, units, flag, near_tile[block], terms, sums)
 
 
 @jit()
@@ -163,33 +146,26 @@ def _measure(
 
 
 @jit()
-def _find_near(
+def _add_squares(
     height: PointArray,
     tile: CellArray,
-    outside: int,
     units: float,
     flag: int,
     near_tile: CellArray,
     terms: IntArray,
+    sums: IntArray,
 ) -> None:
-    """Set tiles and terms of the sums of the points of a block. See `_survey`."""
+    """Set tiles of the points of a block, and add their terms to the sums. See `_survey`."""
+    outside, quarter = np.int32(len(sums) - 1), len(height) // 4
     for i in range(len(height)):
         h = np.float64(height[i])
         near_tile[i] = tile[i] if is_near(h) else outside
         terms[i] = flag + np.int64(whole_units(h * h, units)) if is_near(h) else 0
-
-
-@jit()
-def _add(near_tile: CellArray, terms: IntArray, sums: IntArray) -> None:
-    """Add the terms of a block to the sums of the tiles, in four places in turn.
-
-    Points side by side share a tile, and would wait for each other.
-    """
-    quarter = len(near_tile) // 4
+    # In four places in turn: points side by side share a tile, and would wait for each other.
     for k in range(quarter):
         for i in (k, k + quarter, k + 2 * quarter, k + 3 * quarter):
             sums[np.uintp(near_tile[np.uintp(i)])] += terms[np.uintp(i)]
-    for i in range(4 * quarter, len(near_tile)):
+    for i in range(4 * quarter, len(height)):
         sums[np.uintp(near_tile[i])] += terms[i]
 
 
