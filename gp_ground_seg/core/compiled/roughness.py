@@ -32,27 +32,13 @@ _LANES, _LOW_BYTES = np.uint64(0x0001000100010001), np.uint64(0x00FF00FF00FF00FF
 
 @jit()
 def set_roughness(
-    tiles: Tiles,
-    sums: IntArray,
-    units: float,
-    shift: int,
-    roughness: FloatArray,
+    tiles: Tiles, sums: IntArray, units: float, shift: int, roughness: FloatArray
 ) -> None:
     """Roughness of the ground in each tile, into `roughness` (T + 1,), zeros before [m].
 
-    Parameters
-    ----------
-    tiles : Tiles
-        Tiles of the points.
-    sums : (T + 1,) int64
-        For each tile the number of returns near the surface in the bits from `shift` on, and below
-        the sum of their squared heights; the last one is for points in no tile.
-    units : float
-        Whole units of squared heights for 1 m^2.
-    shift : int
-        Bits below the number.
-    roughness : (T + 1,) float64
-        Stays as it is if no return is near the surface, and for points in no tile.
+    It stays as it is if no return is near the surface, and for points in no tile. For each tile
+    `sums` (T + 1,) have the number of returns near the surface in the bits from `shift` on, and
+    below the sum of their squared heights in `units` for 1 m^2.
     """
     square, n_known = np.full(len(sums) - 1, UNKNOWN), 0
     for t in range(len(square)):

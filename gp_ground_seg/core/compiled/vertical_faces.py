@@ -21,24 +21,21 @@ from gp_ground_seg.core.pipeline.vertical_faces import (
     SCATTERED,
     SQUARE_SCATTERS,
     SUMS,
-    UNITS_PER_METRE,
     face_height,
     is_base_occluded,
     is_examined,
     is_vertical,
+    rounded,
     scatter_square,
     smooth_up_to,
 )
 
 # Each tall tile has two rows, for the lowest returns and for those above: their sums and the
-# greatest height. The first row also holds `_TO_UNITS` less the origin of x and y, and the origin
-# of z.
-_TOP, _TO_UNITS_X, _TO_UNITS_Y, _BASE = SUMS, SUMS + 1, SUMS + 2, SUMS + 3
+# greatest height. The first row also holds the origin of the tile.
+_TOP, _X, _Y, _BASE = SUMS, SUMS + 1, SUMS + 2, SUMS + 3
 N_COLUMNS = SUMS + 4
 NOT_TALL = -1
 """Row of a tile without a tall return."""
-# Adding this to a number and subtracting it again leaves whole units.
-_TO_UNITS = 1.5 * 2.0**52 / UNITS_PER_METRE
 
 
 @jit(entry=True)
@@ -132,9 +129,8 @@ def _sum_returns(
         above = np.float64(z[i]) - low[_BASE]
         if above > max_height:
             continue
-        dx = (np.float64(x[i]) + low[_TO_UNITS_X]) - _TO_UNITS
-        dy = (np.float64(y[i]) + low[_TO_UNITS_Y]) - _TO_UNITS
-        dz = (above + _TO_UNITS) - _TO_UNITS
+        dx, dy = rounded(np.float64(x[i]) - low[_X]), rounded(np.float64(y[i]) - low[_Y])
+        dz = rounded(above)
         # No branch: whether a return is one of the lowest is unpredictable.
         s = sums[np.uintp(k + np.int32(above > foot_height))]
         s[0] += 1.0
@@ -154,15 +150,12 @@ def _sum_returns(
 @jit()
 def _no_sums(tiles: Tiles, tall: CellArray, tile_size: float) -> FloatArray:
     """Lay out the sums of no returns, with the origins of the tall tiles."""
-    n_sides, sums = int(math.sqrt(len(tiles.at))), np.empty((2 * len(tall), N_COLUMNS))
+    n_sides, sums = int(math.sqrt(len(tiles.at))), np.zeros((2 * len(tall), N_COLUMNS))
     half = 0.5 * n_sides * tile_size
     for k in range(len(tall)):
         place = tiles.place[tall[k]]
-        for row in (2 * k, 2 * k + 1):
-            for c in range(_TOP + 1):
-                sums[row, c] = 0.0
         # About a point of the tile: about the sensor, rounding would exceed the scatter.
-        sums[2 * k, _TO_UNITS_X] = _TO_UNITS - ((place // n_sides) * tile_size - half)
-        sums[2 * k, _TO_UNITS_Y] = _TO_UNITS - ((place % n_sides) * tile_size - half)
+        sums[2 * k, _X] = rounded((place // n_sides) * tile_size - half)
+        sums[2 * k, _Y] = rounded((place % n_sides) * tile_size - half)
         sums[2 * k, _BASE] = tiles.extremes[tall[k], 0]
     return sums

@@ -90,8 +90,7 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     row = row[used]
     # Relative to a point of the tile: about the sensor, rounding would exceed the scatter.
     x, y = (
-        scan.xyz[used, i]
-        - _rounded(place * faces.cell_size - 0.5 * n_sides * faces.cell_size)[row]
+        scan.xyz[used, i] - rounded(place * faces.cell_size - 0.5 * n_sides * faces.cell_size)[row]
         for i, place in enumerate(np.divmod(tiles.place[tall], n_sides))
     )
     # Rows of the foot first, then those of the rest.
@@ -158,15 +157,15 @@ def face_height(label: LabelConfig) -> float:
     return label.obstacle_min_height + label.ground_tolerance
 
 
-def _rounded(values: FloatArray) -> FloatArray:
+@shared
+def rounded(values: Values) -> Values:
     """Round to units of `UNITS_PER_METRE`."""
-    result: FloatArray = np.rint(values * UNITS_PER_METRE) / UNITS_PER_METRE
-    return result
+    return np.rint(values * UNITS_PER_METRE) / UNITS_PER_METRE
 
 
 def _sums(x: FloatArray, y: FloatArray, z: FloatArray, row: IntArray, n_rows: int) -> FloatArray:
     """Add up the returns (P,) of each row, (SUMS, n_rows)."""
-    x, y, z = map(_rounded, (x, y, z))
+    x, y, z = map(rounded, (x, y, z))
     terms = np.ones(len(x)), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z
     return np.array([np.bincount(row, term, n_rows) for term in terms])
 
