@@ -53,11 +53,10 @@ def find_faces(
     square = np.empty(len(tall))
     for k in range(len(tall)):
         low, high = sums[2 * k], sums[2 * k + 1]
-        # No branch: between branches, references to the rows would be counted.
-        is_face = is_vertical(low, high, config)
-        is_face &= max(low[_TOP], high[_TOP]) > face_height(label)
+        reaches = max(low[_TOP], high[_TOP]) > face_height(label)
+        is_face = reaches and is_vertical(low, high, config)
         faces.is_face[np.uintp(tall[k])] = is_face
-        is_occluded = is_face & is_base_occluded(low, high, config)
+        is_occluded = is_face and is_base_occluded(low, high, config)
         faces.has_occluded_base[np.uintp(tall[k])] = is_occluded
         square[k] = UNKNOWN if is_face else scatter_square(low, high)
     _mark_scattered(tiles, tall, square, height, label, faces)
