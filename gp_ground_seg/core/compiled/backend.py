@@ -154,8 +154,8 @@ class NumbaBackend:
             # One type also without a point: another would be compiled, for seconds, when it comes.
             scan._replace(xyz=scan.xyz.T),
             faces,
-            linear_pieces(surface.knots, surface.mean, scan.xyz.dtype),
-            relief,
+            linear_pieces(surface.knots, surface.mean, scan.xyz.dtype).reshape(-1),
+            relief.pieces.reshape(-1).astype(scan.xyz.dtype),
             relief.is_level,
             surface.knots[0],
             numbers_of(config.label),

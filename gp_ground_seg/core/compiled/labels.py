@@ -37,7 +37,7 @@ from gp_ground_seg.core.pipeline.labels import (
     vote_of,
     whole_units,
 )
-from gp_ground_seg.core.pipeline.relief import Relief, height_in
+from gp_ground_seg.core.pipeline.relief import height_in
 
 # Plain integers, as compiled code has no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
@@ -52,7 +52,7 @@ def label_points(
     scan: Scan,
     faces: Faces,
     pieces: PointArray,
-    relief: Relief,
+    land: PointArray,
     is_level: bool,
     nearest: float,
     config: LabelConfig,
@@ -65,21 +65,16 @@ def label_points(
 ) -> None:
     """Height, label and margin of each point, into `result`.
 
-    Here `Scan.xyz` is (3, N). `pieces` are those of `linear_pieces`, from the range `nearest` on;
-    `is_level` says whether the relief is level; `depth`, `units`, `shift` and `lowest` are those
-    of `depth_of_ground`, `sum_units`, `number_shift` and `lowest_of`; `by_roughness` is the rule
-    of the parameters.
+    Here `Scan.xyz` is (3, N). `pieces` are those of `linear_pieces`, from the range `nearest` on,
+    `land` those of the relief, and `is_level` says whether it is level; `depth`, `units`, `shift`
+    and `lowest` are those of `depth_of_ground`, `sum_units`, `number_shift` and `lowest_of`;
+    `by_roughness` is the rule of the parameters.
     """
     n_tiles, number = len(scan.tiles.place), result.height.dtype.type
-    near_tile = np.empty(len(result.label), np.int32)
-    sums, roughness = np.zeros(n_tiles + 1, np.int64), np.zeros(n_tiles + 1)
-    land = relief.pieces.reshape(-1).astype(result.height.dtype)
-    tables = pieces.reshape(-1), land, is_level, number(nearest)
-    _survey(scan, *tables, units, np.int64(1) << shift, near_tile, sums, result)
+    tables, roughness = (pieces, land, is_level, number(nearest)), np.zeros(n_tiles + 1)
+    near_tile, sums = _survey(scan, *tables, units, shift, result.height)
     if by_roughness:
-        for t in range(n_tiles):
-            sums[t] = 0 if faces.is_face[t] else sums[t]
-        set_roughness(scan.tiles, sums, units, shift, roughness)
+        set_roughness(scan.tiles, sums, faces.is_face, units, shift, roughness)
     bands, tops = np.empty((2, n_tiles + 1), result.height.dtype)
     for t in range(n_tiles + 1):
         bands[t], tops[t] = ground_band(roughness[t], config), math.inf
@@ -99,17 +94,16 @@ def _survey(
     is_level: bool,
     nearest: float,
     units: float,
-    flag: int,
-    near_tile: CellArray,
-    sums: IntArray,
-    result: Labelled,
-) -> None:
-    """Heights of the points over the surface, tiles of those near it, and sums over each tile.
+    shift: int,
+    height: PointArray,
+) -> tuple[CellArray, IntArray]:
+    """Set the height of each point; return tiles of those near the surface, and their sums.
 
-    Tiles of others are the last one. Each return near the surface adds its squared height in whole
-    units to the sum, and `flag`.
+    Tiles of others are the last one. For the sums see `set_roughness`.
     """
-    x, y, z, height = scan.xyz[0], scan.xyz[1], scan.xyz[2], result.height
+    near_tile = np.empty(len(height), np.int32)
+    sums, flag = np.zeros(len(scan.tiles.place) + 1, np.int64), np.int64(1) << shift
+    x, y, z = scan.xyz[0], scan.xyz[1], scan.xyz[2]
     u, v, piece = np.zeros(BLOCK, z.dtype), np.zeros(BLOCK, z.dtype), np.zeros(BLOCK, np.int32)
     terms = np.empty(BLOCK, np.int64)
     for first in range(0, len(z), BLOCK):
@@ -120,6 +114,7 @@ def _survey(
         _measure(z[block], r, cell, nearest, pieces, land, u, v, piece, height[block])
         tile = scan.tiles.tile[block]
         _add_squares(height[block], tile, units, flag, near_tile[block], terms, sums)
+    return near_tile, sums
 
 
 @jit()

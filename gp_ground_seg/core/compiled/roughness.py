@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gp_ground_seg.core.frame import CellArray, FloatArray, IntArray, Tiles
+from gp_ground_seg.core.frame import BoolArray, CellArray, FloatArray, IntArray, Tiles
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.pipeline.roughness import (
     MOST_OVER_WIDE,
@@ -32,18 +32,23 @@ _LANES, _LOW_BYTES = np.uint64(0x0001000100010001), np.uint64(0x00FF00FF00FF00FF
 
 @jit()
 def set_roughness(
-    tiles: Tiles, sums: IntArray, units: float, shift: int, roughness: FloatArray
+    tiles: Tiles,
+    sums: IntArray,
+    is_face: BoolArray,
+    units: float,
+    shift: int,
+    roughness: FloatArray,
 ) -> None:
     """Roughness of the ground in each tile, into `roughness` (T + 1,), zeros before [m].
 
     It stays as it is if no return is near the surface, and for points in no tile. For each tile
     `sums` (T + 1,) have the number of returns near the surface in the bits from `shift` on, and
-    below the sum of their squared heights in `units` for 1 m^2.
+    below the sum of their squared heights in `units` for 1 m^2; those of faces do not count.
     """
     square, n_known = np.full(len(sums) - 1, UNKNOWN), 0
     for t in range(len(square)):
         number = sums[t] >> shift
-        if number > 0:
+        if number > 0 and not is_face[t]:
             square[t] = np.float64(sums[t] - (number << shift)) / (units * np.float64(number))
             n_known += 1
     if n_known == 0:
