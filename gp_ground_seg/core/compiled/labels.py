@@ -137,7 +137,7 @@ def _measure(
         p = np.uintp(4) * np.uintp(piece[i] if cell[i] >= 0 else np.int32(0))
         own = land[p], land[p + np.uintp(1)], land[p + np.uintp(2)], land[p + np.uintp(3)]
         under = pieces[c] + pieces[c + np.uintp(1)] * max(r[i], nearest)
-        height[i] = z[i] - height_in(own, u[i], v[i]) - under
+        height[i] = z[i] - under - height_in(own, u[i], v[i])
 
 
 @jit()

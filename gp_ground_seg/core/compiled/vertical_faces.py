@@ -73,12 +73,11 @@ def _mark_scattered(
 ) -> None:
     """Mark raised tiles about which many scatter. See the plain `_scattered`."""
     n, face = len(tall), face_height(label)
-    place, counts = np.empty(n, np.int32), np.zeros(N_LEVELS, np.int64)
+    place, counts = tiles.place[tall], np.zeros(N_LEVELS, np.int64)
     level, _ = levels_of(square, SQUARE_SCATTERS)
     for k in range(n):
         low, high = tiles.extremes[tall[k], 0], tiles.extremes[tall[k], 1]
         over = np.float64(low) + height
-        place[k] = tiles.place[tall[k]]
         if not over > 0.5 * face:
             if over > -0.5 * face and np.float64(high) - np.float64(low) <= face:
                 counts[level[k]] += level[k] != UNKNOWN_LEVEL

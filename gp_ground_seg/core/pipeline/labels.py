@@ -24,7 +24,7 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, LabelConfig
-from gp_ground_seg.core.pipeline.relief import Relief, over_relief
+from gp_ground_seg.core.pipeline.relief import Relief
 from gp_ground_seg.core.pipeline.roughness import ground_roughness
 
 HIGHEST_GROUND = 0.5
@@ -60,24 +60,27 @@ def label_points(
     returns near the surface vote (see `mean_votes`).
     """
     grid, tiles, label = scan.grid, scan.tiles, config.label
-    by_roughness, number = label.rule == 'roughness', scan.xyz.dtype.type
+    by_roughness, dtype = label.rule == 'roughness', scan.xyz.dtype
     # NaN outside, as is what follows; tiles there are negative, which index the last row.
-    height = over_relief(scan, relief) - at_points(surface.knots, surface.mean, grid)
+    x, y, z = scan.xyz.T
+    height = z - at_points(surface.knots, surface.mean, grid)
+    if not relief.is_level:
+        inside = np.flatnonzero(grid.inside)
+        height[inside] -= relief.at(x[inside], y[inside])
     near, tile = np.flatnonzero(is_near(height)), as_index(tiles.tile)
     roughness = np.zeros(len(faces.is_face))
     if by_roughness:
         units = sum_units(len(height))
         sums = near_sums(height[near], tile[near], faces.is_face, units)
         roughness = ground_roughness(tiles, sums, units)
-    band, top = ground_band(roughness, label), np.full(len(roughness), np.inf)
+    band, top = ground_band(roughness, label).astype(dtype), np.full(len(roughness), np.inf, dtype)
     at, occluded = np.flatnonzero(faces.is_face), faces.has_occluded_base[faces.is_face]
     top[at] = top_of_face(roughness[at], tiles.lowest_z[at].astype(np.float64), occluded, label)
-    band, top = band.astype(number), top.astype(number)
-    depth = number(depth_of_ground(label))
+    depth = depth_of_ground(label)
     with np.errstate(invalid='ignore'):  # points outside may be infinitely high
-        margin: PointArray = margin_of(height, scan.xyz[:, 2], band[tile], top[tile], depth)
+        margin: PointArray = margin_of(height, z, band[tile], top[tile], depth)
     if by_roughness:
-        heights = scan.xyz[near, 2].astype(np.float64) - lowest_of(surface)
+        heights = z[near].astype(np.float64) - lowest_of(surface)
         voters, means = mean_votes(near, heights, margin, tiles, label.ground_tolerance)
         margin[voters] = margin_after_vote(margin[voters].astype(np.float64), means)
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)

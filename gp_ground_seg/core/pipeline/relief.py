@@ -23,7 +23,6 @@ from gp_ground_seg.core.frame import (
     FloatArray,
     IntArray,
     PointArray,
-    Scan,
     Values,
 )
 from gp_ground_seg.core.jit import shared
@@ -397,15 +396,6 @@ def filled(land: FloatArray, is_known: BoolArray) -> FloatArray:
         land[is_next] = mean[is_next]
         is_known = is_known | is_next
     return land
-
-
-def over_relief(scan: Scan, relief: Relief) -> PointArray:
-    """Height of the points of a scan over the relief, (N,) [m]; of those outside over 0."""
-    over: PointArray = scan.xyz[:, 2].copy()
-    if not relief.is_level:
-        inside = np.flatnonzero(scan.grid.inside)
-        over[inside] -= relief.at(scan.xyz[:, 0][inside], scan.xyz[:, 1][inside])
-    return over
 
 
 @shared
