@@ -108,5 +108,4 @@ def test_labels_are_the_reference(backend, seed, dtype):
     np.testing.assert_array_equal(found.label, expected.label)
     for name in ('height', 'margin'):
         ours, theirs = getattr(found, name), getattr(expected, name)
-        atol = 1e-9 if dtype is np.float64 else 1e-6
-        np.testing.assert_allclose(ours, theirs, rtol=atol, atol=atol, err_msg=name)
+        np.testing.assert_allclose(ours, theirs, atol=max(1e-9, 8 * np.finfo(dtype).eps))
