@@ -15,8 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.jit import shared
-
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 CellArray = npt.NDArray[np.int32]
@@ -257,35 +255,32 @@ class GroundSurface(NamedTuple):
     inlier: BoolArray  # (C,) candidates that the surface rests on
 
 
-def at_points(knots: FloatArray, table: FloatArray, grid: PolarGrid) -> FloatArray:
-    """Value under each point, (N,) float64.
+def at_points(knots: FloatArray, table: FloatArray, grid: PolarGrid) -> PointArray:
+    """Value under each point, (N,), in the precision of the points.
 
     `knots` (K,) are ranges [m], `table` (M, K) the values there, linear between the knots; nearer
     than the first knot it is the first knot's. NaN beyond the last knot.
     """
-    level, slope = linear_pieces(knots, table)
-    cell = as_index(grid.cell)  # where it is negative, the value does not matter
-    with np.errstate(invalid='ignore'):  # points outside may be infinitely far
-        value: FloatArray = slope[cell] * np.maximum(grid.r, knots[0])
-        value += level[cell]
-    value[~grid.inside] = np.nan
+    level, slope = linear_pieces(knots, table, grid.r.dtype).T
+    cell = as_index(grid.cell)
+    value: PointArray = slope[cell] * np.maximum(grid.r, grid.r.dtype.type(knots[0]))
+    value += level[cell]
     return value
 
 
-def linear_pieces(knots: FloatArray, table: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Line across each cell: its value at range 0 and its slope, two (M * n_bins,) float64.
+def linear_pieces(
+    knots: FloatArray, table: FloatArray, dtype: np.dtype[np.floating]
+) -> PointArray:
+    """Line across each cell: its value at range 0 and its slope, (M * n_bins + 1, 2) of `dtype`.
 
-    `knots` (K,) are ranges [m], `table` (M, K) the values there, linear between them.
+    `knots` (K,) are ranges [m], `table` (M, K) the values there, linear between them. The last
+    line, which `OUTSIDE` is the index of, is NaN.
     """
-    level, slope = line_between(knots[:-1], knots[1:], table[:, :-1], table[:, 1:])
-    return level.ravel(), slope.ravel()
-
-
-@shared
-def line_between(r_a: Values, r_b: Values, a: Values, b: Values) -> tuple[Values, Values]:
-    """Value at range 0, and slope, of the line with value `a` at range `r_a` and `b` at `r_b`."""
-    slope = (b - a) / (r_b - r_a)
-    return a - slope * r_a, slope
+    slope = np.diff(table) / np.diff(knots)
+    level = table[:, :-1] - slope * knots[:-1]
+    pieces = np.full((slope.size + 1, 2), np.nan, dtype)
+    pieces[:-1, 0], pieces[:-1, 1] = level.ravel(), slope.ravel()
+    return pieces
 
 
 class Labelled(NamedTuple):
@@ -293,7 +288,9 @@ class Labelled(NamedTuple):
 
     # (N,) `Label` of each point; UNKNOWN for points that are not finite
     label: npt.NDArray[np.uint8]
-    height: FloatArray  # (N,) height of each point over the surface [m]; NaN where there is none
+    # (N,) height of each point over the surface [m], in the precision of the points; NaN where
+    # there is none
+    height: PointArray
     # (N,) distance of each point to the nearer edge of the band that is ground [m], negative for
     # obstacles; NaN where there is no surface
-    margin: FloatArray
+    margin: PointArray

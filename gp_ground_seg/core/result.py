@@ -208,7 +208,7 @@ class Segmentation:
 
         Not negative for ground; NaN where there is no model.
         """
-        return self.labelled.margin
+        return self.labelled.margin.astype(np.float64)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -275,7 +275,7 @@ class Segmentation:
         return self._at_points(self.corrected.return_std)
 
     def _at_points(self, table: FloatArray) -> FloatArray:
-        return at_points(self.surface.knots, table, self.grid)
+        return at_points(self.surface.knots, table, self.grid).astype(np.float64)
 
     @cached_property
     def p_ground(self) -> npt.NDArray[np.float32]:

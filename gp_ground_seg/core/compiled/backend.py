@@ -27,6 +27,7 @@ from gp_ground_seg.core.frame import (
     PolarGrid,
     Scan,
     Tiles,
+    linear_pieces,
 )
 from gp_ground_seg.core.gp.evidence import ODDS, uses_neighbours_in
 from gp_ground_seg.core.gp.latent import given_log_length_scales, given_theta
@@ -34,7 +35,7 @@ from gp_ground_seg.core.gp.learning import Learned, theta_space
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import numbers_of
-from gp_ground_seg.core.pipeline.labels import depth_of_ground, lowest_of, sum_units
+from gp_ground_seg.core.pipeline.labels import depth_of_ground, lowest_of, number_shift, sum_units
 from gp_ground_seg.core.pipeline.lines import find_lines, trace
 from gp_ground_seg.core.pipeline.points import in_columns
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
@@ -156,17 +157,20 @@ class NumbaBackend:
     ) -> Labelled:
         """Height, label and margin of each point."""
         n_points = len(scan.xyz)
-        result = Labelled(np.empty(n_points, np.uint8), np.empty(n_points), np.empty(n_points))
+        numbers = np.empty((2, n_points), scan.xyz.dtype)
+        result = Labelled(np.empty(n_points, np.uint8), *numbers)
         labels.label_points(
             # One type also without a point: another would be compiled, for seconds, when it comes.
             scan._replace(xyz=scan.xyz.T),
             faces,
-            surface,
-            relief,
+            linear_pieces(surface.knots, surface.mean, scan.xyz.dtype).reshape(-1),
+            relief.pieces.reshape(-1).astype(scan.xyz.dtype),
             relief.is_level,
+            surface.knots[0],
             numbers_of(config.label),
             depth_of_ground(height, config.label),
             sum_units(n_points),
+            number_shift(n_points),
             lowest_of(surface),
             config.label.rule == 'roughness',
             result,

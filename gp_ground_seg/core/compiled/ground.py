@@ -70,6 +70,15 @@ class _Columns(NamedTuple):
     whitened: FloatArray  # (n, size) float32, one row for each inlier
 
 
+class _Own(NamedTuple):
+    """Of the n candidates of a segment."""
+
+    r: FloatArray  # (n,) ranges [m]
+    onward: FloatArray  # (n,) see `Frame`
+    in_face: BoolArray  # (n,)
+    inlier: BoolArray  # (n,)
+
+
 class _Prior(NamedTuple):
     """Prior of the heights of all segments."""
 
@@ -255,63 +264,80 @@ def _grow(
 ) -> None:
     """Let the new ones join, and those that then fit, until none does."""
     first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
-    inlier, in_face = by_itself.inlier[first:stop], frame.in_face[first:stop]
-    onward, r, z = frame.onward[first:stop], frame.candidates.r[first:stop], columns.z
+    own = _Own(
+        frame.candidates.r[first:stop],
+        frame.onward[first:stop],
+        frame.in_face[first:stop],
+        by_itself.inlier[first:stop],
+    )
     for i in range(stop - first):
-        columns.r[i], columns.length_scale[i] = r[i], by_itself.log_length_scale[first + i]
+        columns.r[i], columns.length_scale[i] = own.r[i], by_itself.log_length_scale[first + i]
     size = _lay_out(stop - first, prior, columns)
-    n_inliers = done = 0
     for a in range(n_new):
         i = columns.new[a]
-        if odds > 0.0 and in_face[i]:
+        if odds > 0.0 and own.in_face[i]:
             height, variance = _predict(i, columns)
             columns.noise[i] = noise_in_doubt(
-                z[i], height, variance, columns.noise[i], True, odds
+                columns.z[i], height, variance, columns.noise[i], True, odds
             )
+    n_inliers = done = 0
     while n_new > 0 or n_inliers == 0:
         for a in range(n_new):
             i = columns.new[a]
-            inlier[i] = True
-            while done < len(inlier) and inlier[done]:
+            own.inlier[i] = True
+            while done < stop - first and own.inlier[done]:
                 done += 1
             # The columns before are not needed any more.
             _observe(i, n_inliers, min(i, done) & -LANES, size, prior, columns)
             n_inliers += 1
-        n_new, last = 0, done - 1
-        for i in range(done, len(inlier)):
-            # Before anything has joined, only the evidence of neighbours decides.
-            if inlier[i]:
-                last = i
-                continue
-            if n_inliers == 0 and columns.neighbour_precision[i] == 0.0:
-                continue
-            height, variance = _predict(i, columns)
-            follows = fits(z[i], height, variance, prior.noise, growth)
-            if follows and odds > 0.0:
-                columns.noise[i] = noise_in_doubt(
-                    z[i], height, variance, columns.noise[i], in_face[i], odds
-                )
-            if not follows and last >= 0:
-                rise, distance = z[i] - z[last], r[i] - r[last]
-                walkable = is_walkable(rise, distance, growth.max_slope)
-                if walkable and not in_face[i] and not columns.above[i]:
-                    follows = goes_on(rise, distance, onward[i])
-                else:
-                    last = -1  # it stands on the ground, which does not go on behind it
-            if follows:
-                columns.new[n_new] = i
-                n_new += 1
+        n_new = _find_joining(own, done, n_inliers > 0, prior.noise, growth, odds, columns)
         if n_new == 0:
             break
+
+
+@jit(part=True)
+def _find_joining(
+    own: _Own,
+    done: int,
+    has_inliers: bool,
+    noise: float,
+    growth: GrowthConfig,
+    odds: float,
+    columns: _Columns,
+) -> int:
+    """Set the new ones to those from `done` on that now join; return their number."""
+    r, z, n_new, last = own.r, columns.z, 0, done - 1
+    for i in range(done, len(r)):
+        if own.inlier[i]:
+            last = i
+            continue
+        # Before anything has joined, only the evidence of neighbours decides.
+        if not has_inliers and columns.neighbour_precision[i] == 0.0:
+            continue
+        height, variance = _predict(i, columns)
+        joins = fits(z[i], height, variance, noise, growth)
+        if joins and odds > 0.0:
+            columns.noise[i] = noise_in_doubt(
+                z[i], height, variance, columns.noise[i], own.in_face[i], odds
+            )
+        if not joins and last >= 0:
+            rise, distance = z[i] - z[last], r[i] - r[last]
+            walkable = is_walkable(rise, distance, growth.max_slope)
+            if walkable and not own.in_face[i] and not columns.above[i]:
+                joins = goes_on(rise, distance, own.onward[i])
+            else:
+                last = -1  # it stands on the ground, which does not go on behind it
+        if joins:
+            columns.new[n_new] = i
+            n_new += 1
+    return n_new
 
 
 @jit(part=True)
 def _predict(i: int, columns: _Columns) -> tuple[float, float]:
     """Height and variance at candidate i, with the evidence of neighbours."""
     height, variance = np.float64(columns.height[i]), np.float64(columns.variance[i])
-    return combined(
-        height, variance, columns.neighbour_height[i], columns.neighbour_precision[i]
-    )
+    return combined(height, variance, columns.neighbour_height[i], columns.neighbour_precision[i])
 
 
 @jit(part=True)

@@ -16,31 +16,28 @@ from gp_ground_seg.core.frame import (
     BoolArray,
     CellArray,
     Faces,
-    FloatArray,
-    GroundSurface,
     IntArray,
     Label,
     Labelled,
+    PointArray,
     Scan,
     Tiles,
-    line_between,
 )
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import LabelConfig
 from gp_ground_seg.core.pipeline.labels import (
     N_LAYERS,
     VOTE_UNITS,
-    band_margin,
-    face_margin,
-    foot_of_face,
     ground_band,
     is_near,
     layer_of,
     margin_after_vote,
+    margin_of,
+    top_of_face,
     vote_of,
     whole_units,
 )
-from gp_ground_seg.core.pipeline.relief import Relief, height_in
+from gp_ground_seg.core.pipeline.relief import height_in
 
 # Plain integers, as compiled code has no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
@@ -54,175 +51,167 @@ VOTER_FLAG = 2**38
 def label_points(
     scan: Scan,
     faces: Faces,
-    surface: GroundSurface,
-    relief: Relief,
+    pieces: PointArray,
+    land: PointArray,
     is_level: bool,
+    nearest: float,
     config: LabelConfig,
     depth: float,
     units: float,
+    shift: int,
     lowest: float,
     by_roughness: bool,
     result: Labelled,
 ) -> None:
     """Height, label and margin of each point, into `result`.
 
-    Here `Scan.xyz` is (3, N). `is_level` says whether the relief is level; `depth`, `units` and
-    `lowest` are those of `depth_of_ground`, `sum_units` and `lowest_of`; `by_roughness` is the
-    rule of the parameters.
+    Here `Scan.xyz` is (3, N). `pieces` are those of `linear_pieces`, from the range `nearest` on,
+    `land` those of the relief, and `is_level` says whether it is level; `depth`, `units`, `shift`
+    and `lowest` are those of `depth_of_ground`, `sum_units`, `number_shift` and `lowest_of`;
+    `by_roughness` is the rule of the parameters.
     """
-    tiles, n_tiles = scan.tiles, len(scan.tiles.place)
-    sums, bands = np.zeros((n_tiles + 1, 2), np.int64), np.zeros(n_tiles + 1)
-    feet = np.empty(n_tiles + 1)
-    has_obstacle = np.zeros(n_tiles + 1, np.bool_)
-    pieces = _fit_pieces(surface)
-    _survey(scan, faces.is_face, pieces, relief, is_level, units, result.height, sums)
+    n_tiles, number = len(scan.tiles.place), result.height.dtype.type
+    tables, roughness = (pieces, land, is_level, number(nearest)), np.zeros(n_tiles + 1)
+    near_tile, sums = _survey(scan, *tables, units, shift, result.height)
     if by_roughness:
-        set_roughness(tiles, sums, units, bands)
+        set_roughness(scan.tiles, sums, faces.is_face, units, shift, roughness)
+    bands, tops = np.empty((2, n_tiles + 1), result.height.dtype)
     for t in range(n_tiles + 1):
-        feet[t], bands[t] = foot_of_face(bands[t], config), ground_band(bands[t], config)
-    _label_by_bands(scan, faces, feet, depth, bands, has_obstacle, result)
+        bands[t], tops[t] = ground_band(roughness[t], config), math.inf
+        if faces.is_face[t]:
+            low, is_occluded = np.float64(scan.tiles.extremes[t, 0]), faces.has_occluded_base[t]
+            tops[t] = top_of_face(roughness[t], low, is_occluded, config)
+    _label_by_bands(scan, bands, tops, number(depth), result)
     if by_roughness:
-        _vote(scan, lowest, has_obstacle, config, result)
-
-
-@jit()
-def _fit_pieces(surface: GroundSurface) -> FloatArray:
-    """Line of the surface across each cell, level and slope over range, (M * n_bins + 1, 2).
-
-    The last row is for points in no cell, and NaN.
-    """
-    knots, mean = surface.knots, surface.mean
-    n_bins = len(knots) - 1
-    pieces = np.empty((len(mean) * n_bins + 1, 2))
-    for m in range(len(mean)):
-        for n in range(n_bins):
-            piece = line_between(knots[n], knots[n + 1], mean[m, n], mean[m, n + 1])
-            pieces[m * n_bins + n, 0], pieces[m * n_bins + n, 1] = piece
-    pieces[len(pieces) - 1, 0] = pieces[len(pieces) - 1, 1] = math.nan
-    return pieces
+        _vote(scan, near_tile, lowest, config, result)
 
 
 @jit()
 def _survey(
     scan: Scan,
-    is_face: BoolArray,
-    pieces: FloatArray,
-    relief: Relief,
+    pieces: PointArray,
+    land: PointArray,
     is_level: bool,
+    nearest: float,
     units: float,
-    height: FloatArray,
-    sums: IntArray,
-) -> None:
-    """Heights of the points over the surface, and the sums for the roughness of tiles.
+    shift: int,
+    height: PointArray,
+) -> tuple[CellArray, IntArray]:
+    """Set the height of each point; return tiles of those near the surface, and their sums.
 
-    For `pieces` see `_fit_pieces`, for `sums` `gp_ground_seg.core.compiled.roughness`.
+    Tiles of others are the last one. For the sums see `set_roughness`.
     """
-    x, y, tile = scan.xyz[0], scan.xyz[1], scan.tiles.tile
-    land = relief.pieces.reshape(-1, 4)
-    u, v, piece = np.zeros(BLOCK), np.zeros(BLOCK), np.zeros(BLOCK, np.int32)
-    for first in range(0, len(tile), BLOCK):
-        block = slice(first, min(first + BLOCK, len(tile)))
+    near_tile = np.empty(len(height), np.int32)
+    sums, flag = np.zeros(len(scan.tiles.place) + 1, np.int64), np.int64(1) << shift
+    x, y, z = scan.xyz[0], scan.xyz[1], scan.xyz[2]
+    u, v, piece = np.zeros(BLOCK, z.dtype), np.zeros(BLOCK, z.dtype), np.zeros(BLOCK, np.int32)
+    terms = np.empty(BLOCK, np.int64)
+    for first in range(0, len(z), BLOCK):
+        block = slice(first, min(first + BLOCK, len(z)))
         if not is_level:
             find_places(x[block], y[block], u, v, piece)
-        _measure(scan, block, pieces, land, u, v, piece, height[block])
-        _add_squares(tile[block], height[block], is_face, units, sums)
+        r, cell = scan.grid.r[block], scan.grid.cell[block]
+        _measure(z[block], r, cell, nearest, pieces, land, u, v, piece, height[block])
+        tile = scan.tiles.tile[block]
+        _add_squares(height[block], tile, units, flag, near_tile[block], terms, sums)
+    return near_tile, sums
 
 
-@jit(part=True)
+@jit()
 def _measure(
-    scan: Scan,
-    block: slice,
-    pieces: FloatArray,
-    land: FloatArray,
-    u: FloatArray,
-    v: FloatArray,
+    z: PointArray,
+    r: PointArray,
+    cell: CellArray,
+    nearest: float,
+    pieces: PointArray,
+    land: PointArray,
+    u: PointArray,
+    v: PointArray,
     piece: CellArray,
-    height: FloatArray,
+    height: PointArray,
 ) -> None:
     """Heights of the points of a block over the surface and the land."""
-    z, r, cell = scan.xyz[2][block], scan.grid.r[block], scan.grid.cell[block]
-    nearest, outside = scan.grid.edges[0], len(pieces) - 1
-    for i in range(len(height)):
-        c = np.uintp(cell[i] if cell[i] >= 0 else outside)
-        p = np.uintp(piece[i] if cell[i] >= 0 else 0)
-        over = np.float64(z[i]) - height_in(land[p], u[i], v[i])
-        height[i] = over - (pieces[c, 0] + pieces[c, 1] * max(np.float64(r[i]), nearest))
+    outside = np.int32(len(pieces) // 2 - 1)
+    for i in range(len(z)):
+        c = np.uintp(2) * np.uintp(cell[i] if cell[i] >= 0 else outside)
+        p = np.uintp(4) * np.uintp(piece[i] if cell[i] >= 0 else np.int32(0))
+        own = land[p], land[p + np.uintp(1)], land[p + np.uintp(2)], land[p + np.uintp(3)]
+        under = pieces[c] + pieces[c + np.uintp(1)] * max(r[i], nearest)
+        height[i] = z[i] - under - height_in(own, u[i], v[i])
 
 
-@jit(part=True)
+@jit()
 def _add_squares(
-    tile: CellArray, height: FloatArray, is_face: BoolArray, units: float, sums: IntArray
+    height: PointArray,
+    tile: CellArray,
+    units: float,
+    flag: int,
+    near_tile: CellArray,
+    terms: IntArray,
+    sums: IntArray,
 ) -> None:
-    """Add the returns near the surface to the sums of their tiles."""
-    outside = len(sums) - 1
+    """Set tiles of the points of a block, and add their terms to the sums. See `_survey`."""
+    outside, quarter = np.int32(len(sums) - 1), len(height) // 4
     for i in range(len(height)):
-        t = np.uintp(tile[i] if tile[i] >= 0 else outside)
-        if is_near(height[i]) and not is_face[t]:
-            sums[t, 0] += 1
-            sums[t, 1] += int(whole_units(height[i] * height[i], units))
+        h = np.float64(height[i])
+        near_tile[i] = tile[i] if is_near(h) else outside
+        terms[i] = flag + np.int64(whole_units(h * h, units)) if is_near(h) else 0
+    # In four places in turn: points side by side share a tile, and would wait for each other.
+    for k in range(quarter):
+        for i in (k, k + quarter, k + 2 * quarter, k + 3 * quarter):
+            sums[np.uintp(near_tile[np.uintp(i)])] += terms[np.uintp(i)]
+    for i in range(4 * quarter, len(height)):
+        sums[np.uintp(near_tile[i])] += terms[i]
 
 
 @jit()
 def _label_by_bands(
-    scan: Scan,
-    faces: Faces,
-    feet: FloatArray,
-    depth: float,
-    bands: FloatArray,
-    has_obstacle: BoolArray,
-    result: Labelled,
+    scan: Scan, bands: PointArray, tops: PointArray, depth: float, result: Labelled
 ) -> None:
-    """Label the points from their heights in `result`, and find tiles of obstacles.
-
-    Ground reaches `depth` below the surface, `bands` (T + 1,) above it, and `feet` (T + 1,) above
-    the lowest return of a face [m]. `has_obstacle` becomes true where a return near the surface is
-    no ground.
-    """
+    """Label the points from their heights in `result`; `bands` and `tops` are those of tiles."""
     z, tile, cell = scan.xyz[2], scan.tiles.tile, scan.grid.cell
-    is_face, is_occluded, extremes = faces.is_face, faces.has_occluded_base, scan.tiles.extremes
     height, label, margins = result.height, result.label, result.margin
+    last, zero = np.int32(len(bands) - 1), z.dtype.type(0.0)
     for i in range(len(tile)):
-        t = np.uintp(tile[i] if tile[i] >= 0 else len(bands) - 1)
-        margin = band_margin(height[i], bands[t], depth)
-        if is_face[t]:
-            over_lowest = np.float64(z[i]) - np.float64(extremes[t, 0])
-            margin = face_margin(margin, over_lowest, is_occluded[t], feet[t])
-        margins[i] = margin
-        if margin < 0.0 and is_near(height[i]):
-            has_obstacle[t] = True
-    # A loop of its own: without a branch it has vector instructions.
+        t = np.uintp(tile[i] if tile[i] >= 0 else last)
+        margins[i] = margin_of(height[i], z[i], bands[t], tops[t], depth)
+    # A loop of its own has vector instructions.
     for i in range(len(cell)):
-        otherwise = _UNKNOWN if cell[i] == NOT_FINITE else _OBSTACLE
-        label[i] = _GROUND if margins[i] >= 0.0 else otherwise
+        otherwise = np.uint8(_UNKNOWN) if cell[i] == NOT_FINITE else np.uint8(_OBSTACLE)
+        label[i] = np.uint8(_GROUND) if margins[i] >= zero else otherwise
 
 
 @jit()
 def _vote(
-    scan: Scan,
-    lowest: float,
-    has_obstacle: BoolArray,
-    config: LabelConfig,
-    result: Labelled,
+    scan: Scan, near_tile: CellArray, lowest: float, config: LabelConfig, result: Labelled
 ) -> None:
     """Change margins and labels of the returns near an obstacle by the mean votes about them.
 
     `lowest` is that of `lowest_of` [m].
     """
-    rows, around, n_rows = _number_tiles(scan.tiles, has_obstacle)
-    votes = np.zeros((n_rows, N_LAYERS), np.int64)
-    voters, places = _count_votes(
-        scan, lowest, rows, len(around), config, result, votes.reshape(-1)
-    )
-    sums = _sum_around(around, votes)
     margins, unit = result.margin, config.ground_tolerance / VOTE_UNITS
-    for n in range(len(voters)):
-        i, place = np.uintp(voters[n]), places[n]
-        layer, total = place % N_LAYERS, 0
+    has_obstacle, outside = np.zeros(len(scan.tiles.place) + 1, np.bool_), len(scan.tiles.place)
+    for i in range(len(near_tile)):
+        has_obstacle[np.uintp(near_tile[i] if margins[i] < 0.0 else outside)] = True
+    has_obstacle[outside] = False
+    rows, around, n_rows = _number_tiles(scan.tiles, has_obstacle)
+    voters, n = np.empty(len(near_tile) + 1, np.int32), 0
+    for i in range(len(near_tile)):
+        voters[np.uintp(n)] = i
+        n += np.int64(rows[np.uintp(near_tile[i])] > 0)
+    voters, places = voters[:n], np.empty(n, np.int32)
+    votes = _count_votes(scan, voters, near_tile, rows, n_rows, lowest, config, margins, places)
+    sums = _sum_around(around, votes)
+    for k in range(n):
+        layer = places[k] % N_LAYERS
+        if places[k] >= len(sums):
+            continue
+        i, total = np.uintp(voters[k]), 0
         for step in range(N_LAYERS - 1, N_LAYERS + 2):
-            total += sums[np.uintp(place - layer + (layer + step) % N_LAYERS)]
+            total += sums[np.uintp(places[k] - layer + (layer + step) % N_LAYERS)]
         number = total // VOTER_FLAG
         mean = (total - number * VOTER_FLAG) / number - VOTE_UNITS
-        margins[i] = margin_after_vote(margins[i], mean * unit)
+        margins[i] = margin_after_vote(np.float64(margins[i]), mean * unit)
         result.label[i] = _GROUND if margins[i] >= 0.0 else _OBSTACLE
 
 
@@ -256,44 +245,39 @@ def _number_tiles(tiles: Tiles, has_obstacle: BoolArray) -> tuple[CellArray, Cel
     return rows, around, n_rows
 
 
-@jit(part=True)
+@jit()
 def _count_votes(
     scan: Scan,
-    lowest: float,
+    voters: CellArray,
+    near_tile: CellArray,
     rows: CellArray,
-    n_obstacle_rows: int,
+    n_rows: int,
+    lowest: float,
     config: LabelConfig,
-    result: Labelled,
-    votes: IntArray,
-) -> tuple[CellArray, CellArray]:
-    """Add up the votes in each layer, whole numbers.
-
-    Returns the voters in tiles with an obstacle, and the place of the layer of each in `votes`.
-    """
-    tolerance, n = config.ground_tolerance, 0
-    z, tile = scan.xyz[2], scan.tiles.tile
-    voters, places = np.empty(len(tile), np.int32), np.empty(len(tile), np.int32)
-    for i in range(len(tile)):
-        row = rows[np.uintp(tile[i] if tile[i] >= 0 else len(rows) - 1)]
-        if row > 0 and is_near(result.height[i]):
-            over_lowest = np.float64(z[i]) - lowest
-            place = row * N_LAYERS + int(layer_of(over_lowest, tolerance))
-            vote = vote_of(result.margin[i], tolerance)
-            votes[np.uintp(place)] += VOTER_FLAG + int(vote + VOTE_UNITS)
-            if row < n_obstacle_rows:
-                voters[n], places[n] = i, place
-                n += 1
-    return voters[:n], places[:n]
+    margins: PointArray,
+    places: CellArray,
+) -> IntArray:
+    """Add up the votes in each layer of each row, whole numbers, and set the place of each."""
+    votes, tolerance = np.zeros(n_rows * N_LAYERS, np.int64), config.ground_tolerance
+    for k in range(len(voters)):
+        i = np.uintp(voters[k])
+        over_lowest = np.float64(scan.xyz[2, i]) - lowest
+        layer = np.int32(layer_of(over_lowest, tolerance))
+        places[k] = rows[np.uintp(near_tile[i])] * np.int32(N_LAYERS) + layer
+        vote = vote_of(np.float64(margins[i]), tolerance)
+        votes[np.uintp(places[k])] += VOTER_FLAG + np.int64(vote + VOTE_UNITS)
+    return votes
 
 
 @jit(part=True)
 def _sum_around(around: CellArray, votes: IntArray) -> IntArray:
     """Sum the votes of each tile with an obstacle and the eight around it, layer by layer."""
-    sums = np.zeros((len(around), N_LAYERS), np.int64)
+    sums = np.zeros(len(around) * N_LAYERS, np.int64)
     for k in range(1, len(around)):
-        own = sums[k]
+        own = sums[k * N_LAYERS : (k + 1) * N_LAYERS]
         for n in range(9):
-            beside = votes[np.uintp(around[k, n])]
+            first = around[k, n] * N_LAYERS
+            beside = votes[first : first + N_LAYERS]
             for layer in range(N_LAYERS):
                 own[layer] += beside[layer]
-    return sums.reshape(-1)
+    return sums

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from gp_ground_seg.core.compiled.ground import SegmentSurfaces, grow_inliers

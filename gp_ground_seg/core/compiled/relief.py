@@ -107,7 +107,7 @@ def _set_pieces(
             k = _place(i, j)
             if chosen[k]:
                 corners = land[k], land[k + _WIDTH], land[k + 1], land[k + 1 + _WIDTH]
-                level, along_u, along_v, twist = piece_of(*corners, i, j)
+                level, along_u, along_v, twist = piece_of(*corners)
                 pieces[i, j, 0], pieces[i, j, 1] = level, along_u
                 pieces[i, j, 2], pieces[i, j, 3] = along_v, twist
 
@@ -125,7 +125,8 @@ def _behind_of(
     for c in range(len(before)):
         x, y = candidates.x[c], candidates.y[c]
         square = _place(int(square_of(x)), int(square_of(y)))
-        piece = _place(int(from_first_middle(x)), int(from_first_middle(y)))
+        u, v = from_first_middle(x, np.float64), from_first_middle(y, np.float64)
+        piece = _place(int(u), int(v))
         if before[c] and is_known[square]:
             share[piece], is_seen[piece] = 1.0, True
         elif behind[c] and is_known_below[square]:
@@ -139,20 +140,20 @@ def _behind_of(
 @jit()
 def height_at(pieces: FloatArray, x: float, y: float) -> float:
     """Height of the relief at a place [m]."""
-    u, v = from_first_middle(x), from_first_middle(y)
+    u, v = from_first_middle(x, np.float64), from_first_middle(y, np.float64)
     height: float = height_in(pieces[np.uintp(u), np.uintp(v)], u, v)
     return height
 
 
 @jit()
 def find_places(
-    x: PointArray, y: PointArray, u: FloatArray, v: FloatArray, piece: CellArray
+    x: PointArray, y: PointArray, u: PointArray, v: PointArray, piece: CellArray
 ) -> None:
     """Set `u`, `v` and the piece, counted over all, of places (P,) [m], in a loop of vectors."""
-    n = np.int32(N_SIDES - 1)
+    n, number = np.int32(N_SIDES - 1), x.dtype.type
     for i in range(len(x)):
-        along_u, along_v = from_first_middle(np.float64(x[i])), from_first_middle(np.float64(y[i]))
-        u[i], v[i], piece[i] = along_u, along_v, np.int32(along_u) * n + np.int32(along_v)
+        u[i], v[i] = from_first_middle(x[i], number), from_first_middle(y[i], number)
+        piece[i] = np.int32(u[i]) * n + np.int32(v[i])
 
 
 @jit()

@@ -10,9 +10,8 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from gp_ground_seg.core.frame import CellArray, FloatArray, IntArray, Tiles
+from gp_ground_seg.core.frame import BoolArray, CellArray, FloatArray, IntArray, Tiles
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.pipeline.roughness import (
     MOST_OVER_WIDE,
@@ -20,41 +19,42 @@ from gp_ground_seg.core.pipeline.roughness import (
     NEAR,
     ROUGHNESS,
     SQUARE_EDGES,
+    UNKNOWN,
     UNKNOWN_LEVEL,
     WIDE,
     Window,
 )
 
-WordArray = npt.NDArray[np.uint64]
 N_WORDS = N_LEVELS // 8
-_ONES, _LOWEST_BYTE = np.uint64(0x0101010101010101), np.uint64(255)
+_ONES, _HIGHEST = np.uint64(0x0101010101010101), np.uint64(56)
+_LANES, _LOW_BYTES = np.uint64(0x0001000100010001), np.uint64(0x00FF00FF00FF00FF)
 
 
 @jit()
 def set_roughness(
     tiles: Tiles,
     sums: IntArray,
+    is_face: BoolArray,
     units: float,
+    shift: int,
     roughness: FloatArray,
 ) -> None:
     """Roughness of the ground in each tile, into `roughness` (T + 1,), zeros before [m].
 
-    Parameters
-    ----------
-    tiles : Tiles
-        Tiles of the points.
-    sums : (T + 1, 2) int64
-        For each tile the number of returns near the surface and the sum of their squared heights;
-        the last row is for points in no tile.
-    units : float
-        Whole units of squared heights for 1 m^2.
-    roughness : (T + 1,) float64
-        Stays as it is if no return is near the surface, and for points in no tile.
+    It stays as it is if no return is near the surface, and for points in no tile. For each tile
+    `sums` (T + 1,) have the number of returns near the surface in the bits from `shift` on, and
+    below the sum of their squared heights in `units` for 1 m^2; those of faces do not count.
     """
-    level, n_known, of_frame = _levels(sums, units)
+    square, n_known = np.full(len(sums) - 1, UNKNOWN), 0
+    for t in range(len(square)):
+        number = sums[t] >> shift
+        if number > 0 and not is_face[t]:
+            square[t] = np.float64(sums[t] - (number << shift)) / (units * np.float64(number))
+            n_known += 1
     if n_known == 0:
         return
-    n_sides = int(math.sqrt(len(tiles.at)))
+    level, counts = levels_of(square, SQUARE_EDGES)
+    of_frame, n_sides = level_at(counts, n_known, 0.5), int(math.sqrt(len(tiles.at)))
     near = levels_about(tiles.place, level, n_sides, NEAR, of_frame)
     wide = levels_about(tiles.place, level, n_sides, WIDE, of_frame)
     for t in range(len(level)):
@@ -63,21 +63,19 @@ def set_roughness(
 
 
 @jit()
-def _levels(sums: IntArray, units: float) -> tuple[CellArray, int, int]:
-    """Level of each tile, (T,), of how many it is known, and the median of these."""
-    counts, n_known, n_tiles = np.zeros(N_LEVELS, np.int64), 0, len(sums) - 1
-    level = np.empty(n_tiles, np.int32)
-    for t in range(n_tiles):
-        number, level[t] = sums[t, 0], UNKNOWN_LEVEL
-        if number > 0:
-            square = np.float64(sums[t, 1]) / (units * np.float64(number))
-            found = 0
-            for k in range(len(SQUARE_EDGES)):
-                found += np.int64(square >= SQUARE_EDGES[k])
-            level[t] = found
-            counts[found] += 1
-            n_known += 1
-    return level, n_known, level_at(counts, n_known, 0.5)
+def levels_of(square: FloatArray, edges: FloatArray) -> tuple[CellArray, IntArray]:
+    """Level of each square between the `edges`, or `UNKNOWN_LEVEL`, and how many have each."""
+    level, counts = np.full(len(square), UNKNOWN_LEVEL, np.int32), np.zeros(N_LEVELS, np.int64)
+    for k in range(len(square)):
+        level[k] += np.int32(square[k] != UNKNOWN)
+    # Edge by edge, as the inner loop has vector instructions.
+    for edge in edges:
+        for k in range(len(square)):
+            level[k] += np.int32(square[k] >= edge)
+    for k in range(len(square)):
+        if level[k] != UNKNOWN_LEVEL:
+            counts[np.uintp(level[k])] += 1
+    return level, counts
 
 
 @jit()
@@ -88,33 +86,35 @@ def levels_about(
     shift, n_rows = window.shift, 1
     # Blocks in a square with one more at each side, so that each has eight around it.
     width = (n_sides - 1 >> shift) + 3
-    block_to_row = np.zeros(width * width, np.int32)
+    block_to_row, block = np.zeros(width * width, np.int32), np.empty(len(place), np.int32)
     own, row_to_block = np.empty(len(place) + 1, np.int32), np.empty(len(place) + 1, np.int32)
     for k in range(len(place)):
-        column = place[k] // n_sides
-        row = place[k] - column * n_sides
-        block = np.uintp(((column >> shift) + 1) * width + (row >> shift) + 1)
-        if block_to_row[block] == 0:
-            block_to_row[block], row_to_block[n_rows] = n_rows, block
+        # A division of whole numbers has no vector instruction.
+        column = np.int32((place[k] + 0.5) / n_sides)
+        row = place[k] - column * np.int32(n_sides)
+        block[k] = ((column >> shift) + 1) * width + (row >> shift) + 1
+    for k in range(len(place)):
+        b = np.uintp(block[k])
+        if block_to_row[b] == 0:
+            block_to_row[b], row_to_block[n_rows] = n_rows, b
             n_rows += 1
-        own[k] = block_to_row[block]
+        own[k] = block_to_row[b]
     # Row 0 is that of blocks without such a tile. One dimension, as views of rows take longer than
     # the sums.
     counts = np.zeros(n_rows * N_WORDS, np.uint64)
     for k in range(len(place)):
         if level[k] != UNKNOWN_LEVEL:
             counts[np.uintp(own[k] * N_WORDS + level[k] // 8)] += _byte(1, level[k])
-    about, level_of_row = np.empty(N_WORDS, np.uint64), np.empty(n_rows, np.int32)
+    prior, level_of_row = np.zeros(N_WORDS, np.uint64), np.empty(n_rows, np.int32)
+    prior[prior_level // 8] = _byte(window.prior, prior_level)
     for n in range(1, n_rows):
-        for w in range(N_WORDS):
-            about[w] = 0
-        about[prior_level // 8] = _byte(window.prior, prior_level)
+        a, b, c, d = prior[0], prior[1], prior[2], prior[3]
         for step in range(-width, width + 1, width):
             for beside in range(row_to_block[n] + step - 1, row_to_block[n] + step + 2):
-                first = block_to_row[np.uintp(beside)] * N_WORDS
-                for w in range(N_WORDS):
-                    about[w] += counts[np.uintp(first + w)]
-        level_of_row[n] = _level_in(about, window.share)
+                first = np.uintp(block_to_row[np.uintp(beside)] * N_WORDS)
+                a, b = a + counts[first], b + counts[first + np.uintp(1)]
+                c, d = c + counts[first + np.uintp(2)], d + counts[first + np.uintp(3)]
+        level_of_row[n] = _level_in((a, b, c, d), window.share)
     for k in range(len(place)):
         own[k] = level_of_row[np.uintp(own[k])]
     return own
@@ -137,25 +137,18 @@ def _byte(value: int, level: int) -> Any:
 
 
 @jit()
-def _sum_of_bytes(word: Any) -> Any:
-    """Sum of the bytes of a word, at most 255."""
-    # The highest byte of this product is the sum of all.
-    return np.int64((word * _ONES) >> np.uint64(56))
-
-
-@jit()
-def _level_in(words: WordArray, share: float) -> int:
-    """Do what `level_at` does, of counts in bytes."""
-    total = 0
-    for w in range(N_WORDS):
-        total += _sum_of_bytes(words[w])
-    most, w = math.floor(share * (total - 1)), 0
-    while _sum_of_bytes(words[w]) <= most:
-        most -= _sum_of_bytes(words[w])
-        w += 1
-    word, level = words[w], 8 * w
-    while np.int64(word & _LOWEST_BYTE) <= most:
-        most -= np.int64(word & _LOWEST_BYTE)
-        word >>= np.uint64(8)
-        level += 1
-    return level
+def _level_in(words: tuple[Any, ...], share: float) -> int:
+    """Do what `level_at` does, of counts in bytes, without a branch."""
+    total, cumulative, level = np.uint64(0), np.uint64(0), np.uint64(0)
+    for word in words:
+        # The highest byte of this product is the sum of all.
+        total += word * _ONES >> _HIGHEST
+    most = np.uint64(256 + math.floor(share * (np.int64(total) - 1))) * _LANES
+    for word in words:
+        sums = (word + cumulative) * _ONES
+        cumulative = sums >> _HIGHEST
+        # Every other byte in a lane of two, the higher of which is 1 if the sum is at most `most`.
+        for odd in (np.uint64(0), np.uint64(8)):
+            is_below = (most - (sums >> odd & _LOW_BYTES)) >> np.uint64(8) & _LANES
+            level += is_below * _LANES >> np.uint64(48)
+    return int(level)

@@ -10,37 +10,33 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.core.compiled.roughness import level_at, levels_about
+from gp_ground_seg.core.compiled.roughness import level_at, levels_about, levels_of
 from gp_ground_seg.core.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Scan, Tiles
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import FacesConfig, LabelConfig
-from gp_ground_seg.core.pipeline.roughness import N_LEVELS, UNKNOWN_LEVEL
+from gp_ground_seg.core.pipeline.roughness import N_LEVELS, UNKNOWN, UNKNOWN_LEVEL
 from gp_ground_seg.core.pipeline.vertical_faces import (
     OWN_SHARE,
     SCATTER,
     SCATTERED,
     SQUARE_SCATTERS,
     SUMS,
-    UNITS_PER_METRE,
-    UNKNOWN,
     face_height,
     is_base_occluded,
     is_beyond_edge,
     is_examined,
     is_vertical,
+    rounded,
     scatter_square,
     smooth_up_to,
 )
 
 # Each tall tile has two rows, for the lowest returns and for those above: their sums and the
-# greatest height. The first row also holds `_TO_UNITS` less the origin of x and y, and the origin
-# of z.
-_TOP, _TO_UNITS_X, _TO_UNITS_Y, _BASE = SUMS, SUMS + 1, SUMS + 2, SUMS + 3
+# greatest height. The first row also holds the origin of the tile.
+_TOP, _X, _Y, _BASE = SUMS, SUMS + 1, SUMS + 2, SUMS + 3
 N_COLUMNS = SUMS + 4
 NOT_TALL = -1
 """Row of a tile without a tall return."""
-# Adding this to a number and subtracting it again leaves whole units.
-_TO_UNITS = 1.5 * 2.0**52 / UNITS_PER_METRE
 
 
 @jit(entry=True)
@@ -57,11 +53,10 @@ def find_faces(
     square = np.empty(len(tall))
     for k in range(len(tall)):
         low, high = sums[2 * k], sums[2 * k + 1]
-        # No branch: between branches, references to the rows would be counted.
-        is_face = is_vertical(low, high, config)
-        is_face &= max(low[_TOP], high[_TOP]) > face_height(label)
+        reaches = max(low[_TOP], high[_TOP]) > face_height(label)
+        is_face = reaches and is_vertical(low, high, config)
         faces.is_face[np.uintp(tall[k])] = is_face
-        is_occluded = is_face & is_base_occluded(low, high, config)
+        is_occluded = is_face and is_base_occluded(low, high, config)
         faces.has_occluded_base[np.uintp(tall[k])] = is_occluded
         square[k] = UNKNOWN if is_face else scatter_square(low, high)
     _mark_scattered(tiles, tall, square, height, label, faces)
@@ -85,23 +80,16 @@ def _mark_scattered(
 ) -> None:
     """Mark raised tiles about which many scatter. See the plain `_scattered`."""
     n, face = len(tall), face_height(label)
-    place, level = np.empty(n, np.int32), np.empty(n, np.int32)
-    counts, n_own = np.zeros(N_LEVELS, np.int64), 0
+    place, counts = tiles.place[tall], np.zeros(N_LEVELS, np.int64)
+    level, _ = levels_of(square, SQUARE_SCATTERS)
     for k in range(n):
         low, high = tiles.extremes[tall[k], 0], tiles.extremes[tall[k], 1]
         over = np.float64(low) + height
-        place[k], level[k] = tiles.place[tall[k]], UNKNOWN_LEVEL
-        if square[k] == UNKNOWN:
-            continue
-        found = 0
-        for edge in range(len(SQUARE_SCATTERS)):
-            found += np.int64(square[k] >= SQUARE_SCATTERS[edge])
-        if over > 0.5 * face:
-            level[k] = found
-        elif over > -0.5 * face and np.float64(high) - np.float64(low) <= face:
-            counts[found] += 1
-            n_own += 1
-    limit = smooth_up_to(SCATTER[level_at(counts, n_own, OWN_SHARE)])
+        if not over > 0.5 * face:
+            if over > -0.5 * face and np.float64(high) - np.float64(low) <= face:
+                counts[level[k]] += level[k] != UNKNOWN_LEVEL
+            level[k] = UNKNOWN_LEVEL
+    limit = smooth_up_to(SCATTER[level_at(counts, counts.sum(), OWN_SHARE)])
     about = levels_about(place, level, int(math.sqrt(len(tiles.at))), SCATTERED, 0)
     for k in range(n):
         over = np.float64(tiles.extremes[tall[k], 0]) + height
@@ -146,9 +134,8 @@ def _sum_returns(
         above = np.float64(z[i]) - low[_BASE]
         if above > max_height:
             continue
-        dx = (np.float64(x[i]) + low[_TO_UNITS_X]) - _TO_UNITS
-        dy = (np.float64(y[i]) + low[_TO_UNITS_Y]) - _TO_UNITS
-        dz = (above + _TO_UNITS) - _TO_UNITS
+        dx, dy = rounded(np.float64(x[i]) - low[_X]), rounded(np.float64(y[i]) - low[_Y])
+        dz = rounded(above)
         # No branch: whether a return is one of the lowest is unpredictable.
         s = sums[np.uintp(k + np.int32(above > foot_height))]
         s[0] += 1.0
@@ -168,15 +155,12 @@ def _sum_returns(
 @jit()
 def _no_sums(tiles: Tiles, tall: CellArray, tile_size: float) -> FloatArray:
     """Lay out the sums of no returns, with the origins of the tall tiles."""
-    n_sides, sums = int(math.sqrt(len(tiles.at))), np.empty((2 * len(tall), N_COLUMNS))
+    n_sides, sums = int(math.sqrt(len(tiles.at))), np.zeros((2 * len(tall), N_COLUMNS))
     half = 0.5 * n_sides * tile_size
     for k in range(len(tall)):
         place = tiles.place[tall[k]]
-        for row in (2 * k, 2 * k + 1):
-            for c in range(_TOP + 1):
-                sums[row, c] = 0.0
         # About a point of the tile: about the sensor, rounding would exceed the scatter.
-        sums[2 * k, _TO_UNITS_X] = _TO_UNITS - ((place // n_sides) * tile_size - half)
-        sums[2 * k, _TO_UNITS_Y] = _TO_UNITS - ((place % n_sides) * tile_size - half)
+        sums[2 * k, _X] = rounded((place // n_sides) * tile_size - half)
+        sums[2 * k, _Y] = rounded((place % n_sides) * tile_size - half)
         sums[2 * k, _BASE] = tiles.extremes[tall[k], 0]
     return sums

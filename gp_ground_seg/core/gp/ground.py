@@ -122,7 +122,7 @@ class Grown(NamedTuple):
     """Inliers of segments."""
 
     inlier: BoolArray  # (C,) candidates that the surface rests on
-    alike: FloatArray  # (C,) candidates close to each, itself as well, see `noise_among`
+    alike: IntArray  # (C,) candidates close to each, itself as well, see `noise_among`
     doubt: FloatArray  # (C,) variance by which an inlier may be an obstacle [m^2]
 
 
@@ -332,14 +332,13 @@ def goes_on(rise: Values, distance: Values, onward: Values) -> Values:
     return (rise <= 0.0) | (RISES_ON * rise <= onward * distance)
 
 
-def _rows(
-    batch: _Batch, segment: IntArray, place: IntArray
-) -> FloatArray:
+def _rows(batch: _Batch, segment: IntArray, place: IntArray) -> FloatArray:
     """Prior covariance of places (P,), of segments (P,), with all places, (P, n)."""
     r, length_scale = batch.r[segment], batch.length_scale[segment]
     own_r, own_l = batch.r[segment, place][:, None], batch.length_scale[segment, place][:, None]
     rows: FloatArray = paciorek(own_r, own_l, r, length_scale, batch.sill)
-    return rows + line_covariance(own_r, r, *line_variances(batch.observation))
+    rows += line_covariance(own_r, r, *line_variances(batch.observation))
+    return rows
 
 
 def _condition(
@@ -390,24 +389,24 @@ def _regress(
     r, z, length_scale = candidates.r, candidates.z - frame.prior_mean, np.exp(u)
     largest = prior_variance(sill, config.observation, r.max(initial=0.0))
     noise = noise_among(inliers.alike, max(noise, ROUNDING * largest)) + inliers.doubt
+    r, z, length_scale, noise = r[which], z[which], length_scale[which], noise[which]
     offsets = np.searchsorted(which, candidates.offsets)
     size = offsets[segments + 1] - offsets[segments]
     for batch in batches(np.concatenate([[0], np.cumsum(size)])):
         own = segments[batch]
         layout = Padded.of(own, offsets)
-        take = lambda values, fill=0.0: layout.take(values[which], fill)  # noqa: E731
-        own_r, own_l = take(r)[:, :, None], take(length_scale, 1.0)[:, :, None]
+        own_r, own_l = layout.take(r)[:, :, None], layout.take(length_scale, 1.0)[:, :, None]
         is_wanted = np.isfinite(knot_u[own])
         n_knots = int(is_wanted.sum(axis=1).max())
         is_wanted, knots = is_wanted[:, :n_knots], frame.knots[:n_knots]
         knot_l = np.where(is_wanted, np.exp(knot_u[own, :n_knots]), 1.0)[:, None]
         within = paciorek(own_r, own_l, own_r.swapaxes(1, 2), own_l.swapaxes(1, 2), sill)
         within += line_covariance(own_r, own_r.swapaxes(1, 2), *line)
-        add_noise(within, take(noise), layout.mask)
+        add_noise(within, layout.take(noise), layout.mask)
         unit = inverse_of_lower(np.linalg.cholesky(within)) * layout.mask[:, :, None]
         rows = paciorek(own_r, own_l, knots, knot_l, sill) + line_covariance(own_r, knots, *line)
         rows = np.matmul(unit, rows)
-        height = np.matmul(np.matmul(unit, take(z)[:, :, None]).swapaxes(1, 2), rows)[:, 0]
+        height = np.matmul(np.matmul(unit, layout.take(z)[:, :, None]).swapaxes(1, 2), rows)[:, 0]
         variance = prior_variance(sill, config.observation, knots)
         variance = variance - np.einsum('sij,sij->sj', rows, rows)
         mean[own, :n_knots] = np.where(is_wanted, height, np.nan)

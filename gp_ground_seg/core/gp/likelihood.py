@@ -30,8 +30,9 @@ def log_likelihood(
     `theta`, (T,), holds the logarithms of sigma_f, sigma_n [m], sigma_f_bar [log m],
     sigma_l_bar [m], sigma_n_bar [log m], and of the factors on the length-scales of the lines.
     `observation` has the prior of the mean line: it is marginalised, which adds `line_covariance`
-    to the kernel (Rasmussen and Williams 2006, section 2.7). With `latent_terms` the terms of the latent process,
-    ``-1/2 log|B_m|``, are in: the objective is the printed one, which has no upper bound.
+    to the kernel (Rasmussen and Williams 2006, section 2.7). With `latent_terms` the terms of the
+    latent process, ``-1/2 log|B_m|``, are in: the objective is the printed one, which has no upper
+    bound.
 
     Returns the value, ``-inf`` where a covariance is not positive definite, and its gradient in
     `theta`, (T,).

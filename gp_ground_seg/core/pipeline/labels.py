@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import numpy.typing as npt
 
@@ -17,6 +15,7 @@ from gp_ground_seg.core.frame import (
     IntArray,
     Label,
     Labelled,
+    PointArray,
     Scan,
     Tiles,
     Values,
@@ -25,14 +24,14 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, LabelConfig
-from gp_ground_seg.core.pipeline.relief import Relief, over_relief
+from gp_ground_seg.core.pipeline.relief import Relief
 from gp_ground_seg.core.pipeline.roughness import ground_roughness
 
-FINEST_UNITS = 2.0**40
-"""Most of `sum_units`."""
 HIGHEST_GROUND = 0.5
 """Height over the surface from which no return is ground, however rough the ground is [m]; returns
 below it tell how rough it is."""
+FINEST_UNITS = 2.0**40
+"""Most of `sum_units`."""
 ROUGHNESS_IN_BAND = 2.1
 """Height over the surface up to which a return is ground, in roughnesses of the ground about it:
 of returns spread evenly over the height of grass all are within 1.7, of those normally distributed
@@ -62,29 +61,29 @@ def label_points(
     returns near the surface vote (see `mean_votes`).
     """
     grid, tiles, label = scan.grid, scan.tiles, config.label
-    z = scan.xyz[:, 2].astype(np.float64)
-    # NaN outside, as is what follows; tiles there are negative, which index something.
-    over = over_relief(scan, z, relief) - at_points(surface.knots, surface.mean, grid)
-    tile = as_index(tiles.tile)
-    in_face = faces.is_face[tile] & grid.inside
-    roughness, band = np.full((2, len(tiles.place) + 1), [[0.0], [label.ground_tolerance]])
-    if label.rule == 'roughness':
-        units = sum_units(len(z))
-        roughness = ground_roughness(tiles, _near_sums(over, tiles, in_face, units), units)
-        band = ground_band(roughness, label)
-    margin: FloatArray = band_margin(over, band[tile], depth_of_ground(height, label))
-    of_face = np.flatnonzero(in_face)
-    margin[of_face] = face_margin(
-        margin[of_face],
-        z[of_face] - tiles.lowest_z[tile[of_face]],
-        faces.has_occluded_base[tile[of_face]],
-        foot_of_face(roughness, label)[tile[of_face]],
-    )
-    if label.rule == 'roughness':
-        voters = np.flatnonzero(is_near(over))
-        heights = z[voters] - lowest_of(surface)
-        voters, means = mean_votes(voters, heights, margin, tiles, label.ground_tolerance)
-        margin[voters] = margin_after_vote(margin[voters], means)
+    by_roughness, dtype = label.rule == 'roughness', scan.xyz.dtype
+    # NaN outside, as is what follows; tiles there are negative, which index the last row.
+    x, y, z = scan.xyz.T
+    over = z - at_points(surface.knots, surface.mean, grid)
+    if not relief.is_level:
+        inside = np.flatnonzero(grid.inside)
+        over[inside] -= relief.at(x[inside], y[inside])
+    near, tile = np.flatnonzero(is_near(over)), as_index(tiles.tile)
+    roughness = np.zeros(len(faces.is_face))
+    if by_roughness:
+        units = sum_units(len(over))
+        sums = near_sums(over[near], tile[near], faces.is_face, units)
+        roughness = ground_roughness(tiles, sums, units)
+    band, top = ground_band(roughness, label).astype(dtype), np.full(len(roughness), np.inf, dtype)
+    at, occluded = np.flatnonzero(faces.is_face), faces.has_occluded_base[faces.is_face]
+    top[at] = top_of_face(roughness[at], tiles.lowest_z[at].astype(np.float64), occluded, label)
+    depth = depth_of_ground(height, label)
+    with np.errstate(invalid='ignore'):  # points outside may be infinitely high
+        margin: PointArray = margin_of(over, z, band[tile], top[tile], depth)
+    if by_roughness:
+        heights = z[near].astype(np.float64) - lowest_of(surface)
+        voters, means = mean_votes(near, heights, margin, tiles, label.ground_tolerance)
+        margin[voters] = margin_after_vote(margin[voters].astype(np.float64), means)
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
     return Labelled(result, over, margin)
@@ -117,26 +116,26 @@ def ground_band(roughness: Values, label: LabelConfig) -> Values:
 
 
 @shared
-def band_margin(height: Values, band: Values, depth: float) -> Values:
-    """Distance of a point to the nearer edge of the band of ground [m], negative outside it."""
-    to_upper, to_lower = band - height, height + depth
-    return choose(to_upper < to_lower, to_upper, to_lower)
-
-
-@shared
-def foot_of_face(roughness: Values, label: LabelConfig) -> Values:
-    """Height over the lowest return of a vertical face up to which others are ground [m]."""
+def top_of_face(
+    roughness: Values, lowest: Values, is_occluded: Values, label: LabelConfig
+) -> Values:
+    """Height up to which returns of a vertical face are ground, about its lowest one [m]."""
     by_roughness = np.minimum(ROUGHNESS_IN_BAND * roughness, ROUGH_FOOT)
-    return np.maximum(by_roughness, FACE_SHARE * label.ground_tolerance)
+    foot = np.maximum(by_roughness, FACE_SHARE * label.ground_tolerance)
+    # With a limit below the lowest no return of the tile is ground; the margin stays a distance.
+    return lowest + foot * (1.0 - 2.0 * is_occluded)
 
 
 @shared
-def face_margin(margin: Values, over_lowest: Values, is_occluded: Values, foot: Values) -> Values:
-    """Margin of a point in a vertical face [m]; `over_lowest` is its height over the lowest."""
-    # With a limit below zero no return of the tile is ground; the margin stays a distance.
-    in_face = foot * (1.0 - 2.0 * is_occluded) - over_lowest
-    # Without a surface `margin` is NaN, and stays so.
-    return choose(in_face < margin, in_face, margin)
+def margin_of(height: Values, z: Values, band: Values, top: Values, depth: Values) -> Values:
+    """Distance of a point to the nearest edge of what is ground [m], negative outside it.
+
+    Ground reaches `depth` below the surface and `band` above it, and not above `top`, which is
+    infinite where there is no vertical face. NaN without a surface.
+    """
+    to_upper, to_lower, to_top = band - height, height + depth, top - z
+    margin = choose(to_upper < to_lower, to_upper, to_lower)
+    return choose(to_top < margin, to_top, margin)
 
 
 def lowest_of(surface: GroundSurface) -> float:
@@ -174,7 +173,7 @@ def margin_after_vote(margin: Values, mean: Values) -> Values:
 
 
 def mean_votes(
-    voters: IntArray, over_lowest: FloatArray, margin: FloatArray, tiles: Tiles, tolerance: float
+    voters: IntArray, over_lowest: FloatArray, margin: PointArray, tiles: Tiles, tolerance: float
 ) -> tuple[IntArray, FloatArray]:
     """Mean vote about each return near an obstacle.
 
@@ -189,7 +188,7 @@ def mean_votes(
         Points that vote: those near the surface.
     over_lowest : (V,) float64
         Their heights over `lowest_of` [m].
-    margin : (N,) float64
+    margin : (N,) array
         Margins of all points before the vote (see `Labelled`) [m].
     tiles : Tiles
         Tiles of all points.
@@ -233,21 +232,21 @@ def mean_votes(
         sums: FloatArray = sum(three[entries] for entries in about)
         return sums
 
-    mean = total(vote_of(margin[voters], tolerance)) / total(None)
+    votes = vote_of(margin[voters].astype(np.float64), tolerance)
+    mean = total(votes) / total(None)
     return voters[is_changed], mean * (tolerance / VOTE_UNITS)
 
 
-def _near_sums(height: FloatArray, tiles: Tiles, in_face: BoolArray, units: float) -> FloatArray:
-    """Count the returns near the surface in each tile, and sum their squared heights, (2, T).
+def near_sums(height: PointArray, tile: IntArray, is_face: BoolArray, units: float) -> FloatArray:
+    """Count returns in each tile, and sum their squared heights in whole units, (2, T).
 
-    `height` (N,) is over the surface [m], NaN where there is none; points `in_face` (N,), of
-    vertical faces, are no roughness of the ground. The sums are in whole units.
+    `height` (P,) is over the surface [m]; vertical faces are no roughness of the ground.
     """
-    near = np.flatnonzero(is_near(height) & ~in_face)
-    tile, heights = as_index(tiles.tile[near]), height[near]
-    sums = np.empty((2, len(tiles.place)))
-    sums[0] = np.bincount(tile, minlength=sums.shape[1])
-    sums[1] = np.bincount(tile, whole_units(heights * heights, units), sums.shape[1])
+    n_tiles, squares = len(is_face) - 1, np.square(height.astype(np.float64))
+    sums = np.empty((2, n_tiles))
+    sums[0] = np.bincount(tile, minlength=n_tiles)
+    sums[1] = np.bincount(tile, whole_units(squares, units), n_tiles)
+    sums[:, is_face[:-1]] = 0.0
     return sums
 
 
@@ -260,10 +259,16 @@ def whole_units(value: Values, units: float) -> Values:
 def sum_units(n_points: int) -> float:
     """Whole units that squared heights of returns near the surface are rounded to [1/m^2].
 
-    The order in which whole numbers are summed does not matter. The sum over all points fits
-    into 63 bits even if each is as far from the surface as `is_near` allows.
+    The order in which whole numbers are summed does not matter. Even if each return is as far from
+    the surface as `is_near` allows, their number in the highest bits, see `number_shift`, and
+    the sum below it fit into 63 bits.
     """
-    return min(FINEST_UNITS, 2.0 ** math.floor(62.0 - math.log2(max(n_points, 1))))
+    return min(FINEST_UNITS, 2.0 ** (65 - 2 * n_points.bit_length()))
+
+
+def number_shift(n_points: int) -> int:
+    """Bits of the sum of squares below the number of returns, where one integer holds both."""
+    return 63 - n_points.bit_length()
 
 
 def ground_probability(margin: FloatArray, std: FloatArray) -> npt.NDArray[np.float32]:

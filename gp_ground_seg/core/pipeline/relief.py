@@ -10,6 +10,7 @@ the height of banks and hills, and fades where the land is as high as the prior 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,6 @@ from gp_ground_seg.core.frame import (
     FloatArray,
     IntArray,
     PointArray,
-    Scan,
     Values,
 )
 from gp_ground_seg.core.jit import shared
@@ -88,18 +88,18 @@ class Relief(NamedTuple):
     def of(cls, height: FloatArray) -> Relief:
         """Relief by its height in the middle of each square, (N_SIDES, N_SIDES) [m]."""
         corners = height[:-1, :-1], height[1:, :-1], height[:-1, 1:], height[1:, 1:]
-        u, v = np.indices(corners[0].shape).astype(np.float64)
-        return cls(np.stack(piece_of(*corners, u, v), axis=-1))
+        return cls(np.stack(piece_of(*corners), axis=-1))
 
-    def at(self, x: PointArray, y: PointArray) -> FloatArray:
-        """Height at places (P,) that are finite, (P,) [m]."""
-        u, v = (from_first_middle(place.astype(np.float64)) for place in (x, y))
+    def at(self, x: PointArray, y: PointArray) -> PointArray:
+        """Height at places (P,) that are finite, (P,) [m], in their precision."""
+        u, v = (from_first_middle(place, x.dtype.type) for place in (x, y))
         # One index: with two it takes three times as long.
         place = u.astype(np.int64) * (N_SIDES - 1) + v.astype(np.int64)
-        result: FloatArray = height_in(self.pieces.reshape(-1, 4).take(place, axis=0).T, u, v)
+        pieces = self.pieces.reshape(-1, 4).astype(x.dtype)
+        result: PointArray = height_in(pieces.take(place, axis=0).T, u, v)
         return result
 
-    def at_knots(self, knots: FloatArray, n_segments: int) -> FloatArray:
+    def at_knots(self, knots: FloatArray, n_segments: int) -> PointArray:
         """Height at ranges `knots` (K,) in the middle of each segment, (M, K) [m]."""
         azimuth = 2.0 * np.pi * (np.arange(n_segments)[:, None] + 0.5) / n_segments - np.pi
         x, y = (knots * np.cos(azimuth)).ravel(), (knots * np.sin(azimuth)).ravel()
@@ -142,7 +142,10 @@ def _is_behind(sides: list[Candidates], lands: list[tuple[FloatArray, BoolArray]
     rings = np.full((2, N_SIDES - 1, N_SIDES - 1), N_SIDES, dtype=np.int32)
     for ring, side, (_, is_known) in zip(rings, sides, lands, strict=True):
         known = is_known[square_of(side.x).astype(np.int64), square_of(side.y).astype(np.int64)]
-        u, v = (from_first_middle(place[known]).astype(np.int64) for place in (side.x, side.y))
+        u, v = (
+            from_first_middle(place[known], np.float64).astype(np.int64)
+            for place in (side.x, side.y)
+        )
         is_empty = np.ones(ring.shape, dtype=np.bool_)
         is_empty[u, v] = False
         if len(u):
@@ -373,19 +376,6 @@ def filled(land: FloatArray, is_known: BoolArray) -> FloatArray:
     return land
 
 
-def over_relief(scan: Scan, z: FloatArray, relief: Relief) -> FloatArray:
-    """Height over the relief of the points of a scan, of their heights `z`, (N,) each [m].
-
-    Points outside the grid keep theirs.
-    """
-    if relief.is_level:
-        return z
-    over: FloatArray = z.copy()
-    inside = np.flatnonzero(scan.grid.inside)
-    over[inside] -= relief.at(scan.xyz[:, 0][inside], scan.xyz[:, 1][inside])
-    return over
-
-
 @shared
 def square_of(place: Values) -> Values:
     """Square along x or y in which a place [m] lies, at most the last; a float."""
@@ -400,28 +390,28 @@ def middle_of(square: Values) -> Values:
 
 
 @shared
-def from_first_middle(place: Values) -> Values:
-    """Squares from the middle of the first one to a place [m], along x or y, within the relief."""
-    beyond = (place + REACH) / SIDE - 0.5
-    return np.minimum(np.maximum(beyond, 0.0), N_SIDES - 1.0 - 1e-6)
+def from_first_middle(place: Values, number: Callable[[float], Values]) -> Values:
+    """Squares from the middle of the first one to a place [m], along x or y, within the relief.
+
+    `number` is the type of the place.
+    """
+    beyond = (place + number(REACH)) * number(1.0 / SIDE) - number(0.5)
+    return np.minimum(np.maximum(beyond, number(0.0)), number(N_SIDES - 1.0 - 1e-5))
 
 
 @shared
-def piece_of(
-    a: Values, b: Values, c: Values, d: Values, u: Values, v: Values
-) -> tuple[Values, Values, Values, Values]:
-    """Factors of 1, u, v and u v in the height between four middles, `u` and `v` at the first.
+def piece_of(a: Values, b: Values, c: Values, d: Values) -> tuple[Values, Values, Values, Values]:
+    """Factors of 1, u, v and u v in the height between four middles, u and v from the first.
 
     That height is `a` there, `b` one square on along u, `c` along v, and `d` along both.
     """
-    twist = (a - b) - (c - d)
-    along_u, along_v = (b - a) - twist * v, (c - a) - twist * u
-    return a - along_u * u - along_v * v - twist * u * v, along_u, along_v, twist
+    return a, b - a, c - a, (a - b) - (c - d)
 
 
 @shared
 def height_in(piece: Values, u: Values, v: Values) -> Values:
-    """Height at a place in the four factors of `piece_of` [m]."""
+    """Height at a place, from `from_first_middle`, in the four factors of `piece_of` [m]."""
+    u, v = u - np.floor(u), v - np.floor(v)
     return piece[0] + piece[1] * u + (piece[2] + piece[3] * u) * v
 
 

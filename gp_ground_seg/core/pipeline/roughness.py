@@ -22,6 +22,8 @@ SQUARE_EDGES = EDGES * EDGES
 ROUGHNESS = np.concatenate([[0.01], EDGES * math.sqrt(1.14)])
 """Roughness of each level: the geometric mean of its edges [m]."""
 N_LEVELS, UNKNOWN_LEVEL = len(ROUGHNESS), -1
+UNKNOWN = -1.0
+"""Square of a roughness, or of a scatter, that is not known [m^2]."""
 
 
 class Window(NamedTuple):

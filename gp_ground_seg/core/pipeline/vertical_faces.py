@@ -31,6 +31,7 @@ from gp_ground_seg.core.pipeline.roughness import (
     N_LEVELS,
     ROUGHNESS,
     SQUARE_EDGES,
+    UNKNOWN,
     UNKNOWN_LEVEL,
     Window,
     level_at,
@@ -52,8 +53,6 @@ SCATTER = 0.25 * ROUGHNESS
 SQUARE_SCATTERS = SQUARE_EDGES / 16.0
 """Scatter about a plane of each level of `gp_ground_seg.core.pipeline.roughness`, and the squares
 between them [m, m^2]."""
-UNKNOWN = -1.0
-"""Square of a scatter that is not known [m^2]."""
 SCATTERED = Window(2, 0.75, 4)
 """Window of the raised tiles among which many may scatter: of 6 m, for tiles of 0.5 m."""
 SMOOTH, TIMES_OWN, OWN_SHARE = 0.025, 4.5, 0.75
@@ -92,8 +91,7 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     row = row[used]
     # Relative to a point of the tile: about the sensor, rounding would exceed the scatter.
     x, y = (
-        scan.xyz[used, i]
-        - _rounded(place * faces.cell_size - 0.5 * n_sides * faces.cell_size)[row]
+        scan.xyz[used, i] - rounded(place * faces.cell_size - 0.5 * n_sides * faces.cell_size)[row]
         for i, place in enumerate(np.divmod(tiles.place[tall], n_sides))
     )
     # Rows of the foot first, then those of the rest.
@@ -175,15 +173,15 @@ def face_height(label: LabelConfig) -> float:
     return label.obstacle_min_height + label.ground_tolerance
 
 
-def _rounded(values: FloatArray) -> FloatArray:
+@shared
+def rounded(values: Values) -> Values:
     """Round to units of `UNITS_PER_METRE`."""
-    result: FloatArray = np.rint(values * UNITS_PER_METRE) / UNITS_PER_METRE
-    return result
+    return np.rint(values * UNITS_PER_METRE) / UNITS_PER_METRE
 
 
 def _sums(x: FloatArray, y: FloatArray, z: FloatArray, row: IntArray, n_rows: int) -> FloatArray:
     """Add up the returns (P,) of each row, (SUMS, n_rows)."""
-    x, y, z = map(_rounded, (x, y, z))
+    x, y, z = map(rounded, (x, y, z))
     terms = np.ones(len(x)), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z
     return np.array([np.bincount(row, term, n_rows) for term in terms])
 
