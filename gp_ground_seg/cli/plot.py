@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.picture == 'scan':
         said = plot_scan_view(points, result.label, path, title, arguments.camera, truth=truth)
     else:
-        said = plot_segment(result, config, points, arguments.segment, path, truth, title)
+        said = plot_segment(result, points, arguments.segment, path, truth, title)
     print(f'{said}, written to {shown(path)}')
     options.note_spared(config, used)
     return 0

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import ConfigError, in_thousands, require
+from gp_ground_seg.core.errors import in_thousands, require
 from gp_ground_seg.core.frame import OUTSIDE, BoolArray, FloatArray, Label
-from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.points import take_points
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.files import staged_file, writing
@@ -161,7 +160,6 @@ N_OF_LINE = 16  # places at which a line is drawn over the relief
 
 def plot_segment(
     result: Segmentation,
-    config: Config,
     points: npt.ArrayLike,
     segments: Sequence[int],
     path: str | Path,
@@ -170,9 +168,9 @@ def plot_segment(
 ) -> str:
     """Draw segments from the side, side by side; below each the length-scale and pseudo-inputs.
 
-    `result` is the segmentation of `points`, (N, >=3) [m], under `config`. `truth` (N,) are true
-    labels, UNKNOWN where a point does not count. The axes end a little beyond the last candidate.
-    The file `path` is replaced. Return numbers of what is in them.
+    `result` is the segmentation of `points`, (N, >=3) [m]. `truth` (N,) are true labels, UNKNOWN
+    where a point does not count. The axes end a little beyond the last candidate. The file `path`
+    is replaced. Return numbers of what is in them.
     """
     z = result.pose.level(take_points(points).astype(np.float64))[:, 2].astype(np.float64)
     views = [SegmentView(result, segment, z) for segment in segments]
@@ -185,7 +183,7 @@ def plot_segment(
         above.set_title(name, fontsize=12, loc='left', parse_math=False)
         view.draw_points(above, truth)
         view.draw_ground(above)
-        view.draw_length_scale(below, config)
+        view.draw_length_scale(below)
         title = ''
     reach = max(view.reach() for view in views)
     lows, highs = zip(*(view.heights_shown() for view in views), strict=True)
@@ -209,36 +207,25 @@ class SegmentView:
     """
 
     def __init__(self, result: Segmentation, segment: int, z: FloatArray) -> None:
-        n_segments = result.grid.n_segments
-        if not 0 <= segment < n_segments:
-            raise ConfigError(f'segment {segment}: must be in [0, {n_segments - 1}]')
-        self._result, self._segment = result, segment
+        self._result, self._segment, self._own = result, segment, result.segment(segment)
         self._inside = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
         self.r, self.z = result.grid.r[self._inside], z[self._inside]
-        first, last = result.candidates.offsets[segment : segment + 2].tolist()
-        own = result.candidates.where(result.candidates.segment == segment)
-        self._r, self._z = own.r, own.z + result.relief.at(own.x, own.y)
-        self._inlier = result.surface.inlier[first:last]
-        self._lines = np.unique(result.lines.line[first:last])
-        self._knots = result.surface.knots
-        self._std = result.surface.std[segment]
-        self._mean = result.surface.mean[segment] + self._relief(self._knots)
 
     @property
     def name(self) -> str:
         """Number of the segment and its azimuths, and whether it has a ground model."""
         width = 360.0 / self._result.grid.n_segments
         first, last = (width * (self._segment + k) - 180.0 for k in (0, 1))
-        model = '' if np.isfinite(self._mean).any() else ': no ground model'
+        model = '' if len(self._own.knots) else ': no ground model'
         return f'segment {self._segment}, azimuth {first:g}° to {last:g}°{model}'
 
     @property
     def counts(self) -> str:
         """Numbers of candidates, inliers and pseudo-inputs."""
-        n_pseudo = np.diff(self._result.pseudo.offsets)[self._segment]
+        own = self._own
         return (
-            f'segment {self._segment}: {len(self._r)} candidates, {self._inlier.sum()} inliers, '
-            f'{n_pseudo} pseudo-inputs'
+            f'segment {self._segment}: {len(own.r)} candidates, {own.inlier.sum()} inliers, '
+            f'{len(own.pseudo_r)} pseudo-inputs'
         )
 
     def _relief(self, r: FloatArray) -> FloatArray:
@@ -248,7 +235,7 @@ class SegmentView:
 
     def reach(self) -> float:
         """Return the range that holds all candidates, or if none all points [m]."""
-        r = self._r if len(self._r) else self.r
+        r = self._own.r if len(self._own.r) else self.r
         return float(r.max()) + BEYOND if len(r) else float(self._result.grid.edges[-1])
 
     def draw_points(self, axes: Any, truth: Labels | None) -> None:
@@ -260,23 +247,24 @@ class SegmentView:
 
     def draw_ground(self, axes: Any) -> None:
         """Draw ground, lines and candidates over range."""
-        low, high = self._mean - 2.0 * self._std, self._mean + 2.0 * self._std
+        own = self._own
+        low, high = own.mean - 2.0 * own.std, own.mean + 2.0 * own.std
         look = {'linewidth': 0.0, 'color': SURFACE_COLOUR, 'alpha': 0.15, 'zorder': 3}
-        axes.fill_between(self._knots, low, high, label='surface ± 2 std', **look)
+        axes.fill_between(own.knots, low, high, label='surface ± 2 std', **look)
         self._draw_lines(axes)
-        axes.plot(self._knots, self._mean, color=SURFACE_COLOUR, lw=1.8, zorder=5, label='surface')
+        axes.plot(own.knots, own.mean, color=SURFACE_COLOUR, lw=1.8, zorder=5, label='surface')
         for name, chosen, inner in (
-            ('rejected', ~self._inlier, 'white'),
-            ('inliers', self._inlier, CANDIDATE_COLOUR),
+            ('rejected', ~own.inlier, 'white'),
+            ('inliers', own.inlier, CANDIDATE_COLOUR),
         ):
             look = {'mfc': inner, 'mec': CANDIDATE_COLOUR, 'ms': 5.5, 'zorder': 7}
             label = f'candidates, {name}'
-            axes.plot(self._r[chosen], self._z[chosen], 'o', label=label, **look)
+            axes.plot(own.r[chosen], own.z[chosen], 'o', label=label, **look)
         axes.set_ylabel('height z, sensor frame [m]')
 
     def heights_shown(self) -> tuple[float, float]:
         """Limits around the inliers, or if none the lower half of the points [m]."""
-        z = self._z[self._inlier]
+        z = self._own.z[self._own.inlier]
         if not len(z):
             z = np.quantile(self.z, (0.0, 0.5)) if len(self.z) else np.array([-2.0, 0.0])
         return float(z.min()) - BELOW, float(z.max()) + ABOVE
@@ -284,35 +272,33 @@ class SegmentView:
     def _draw_lines(self, axes: Any) -> None:
         """Draw each line over its extent, and the critical points where the next one begins."""
         candidates, lines = self._result.candidates, self._result.lines
+        first, last = candidates.offsets[self._segment : self._segment + 2]
+        numbers = np.unique(lines.line[first:last])
         look = {'color': LINE_COLOUR, 'lw': 3.2, 'alpha': 0.75, 'zorder': 4, 'label': 'lines'}
         share = np.linspace(0.0, 1.0, N_OF_LINE)
-        for q in self._lines:
+        for q in numbers:
             points = slice(lines.start[q], lines.start[q + 1])
             if points.stop - points.start > 1:
                 ends = line_ends(candidates.r[points], candidates.z[points], float(lines.slope[q]))
                 r, z = (a + share * (b - a) for a, b in ends)
                 axes.plot(r, z + self._relief(r), **look)
                 look['label'] = None  # one entry in the legend for all
-        critical = lines.start[self._lines[1:]] - candidates.offsets[self._segment]
+        critical = lines.start[numbers[1:]] - first
         axes.plot(
-            self._r[critical], self._z[critical], 'd', ms=9, mfc='none', mec=LINE_COLOUR,
+            self._own.r[critical], self._own.z[critical], 'd', ms=9, mfc='none', mec=LINE_COLOUR,
             zorder=8, label='critical points',
         )  # fmt: skip
 
-    def draw_length_scale(self, axes: Any, config: Config) -> None:
+    def draw_length_scale(self, axes: Any) -> None:
         """Draw the length-scale over range, its limits, and the pseudo-inputs it follows."""
         from matplotlib.ticker import LogLocator
 
-        result = self._result
-        length_scale = np.exp(result.log_length_scale[self._segment])
-        axes.plot(self._knots, length_scale, color=SURFACE_COLOUR, lw=1.8, label='length-scale')
-        if config.length_scale.model == 'latent':
-            own = slice(*result.pseudo.offsets[self._segment : self._segment + 2])
-            shared = result.theta[5 + result.pseudo.kind[own]]
-            l_bar = np.exp(result.pseudo.log_extent[own] + shared)
+        own, limits = self._own, self._result.config.length_scale
+        axes.plot(own.knots, own.length_scale, color=SURFACE_COLOUR, lw=1.8, label='length-scale')
+        if limits.model == 'latent':
             look = {'ms': 5, 'color': PSEUDO_INPUT_COLOUR, 'mew': 0.0, 'label': 'pseudo-inputs'}
-            axes.plot(result.pseudo.r_bar[own], l_bar, 's', **look)
-        for limit in (config.length_scale.min, config.length_scale.max):
+            axes.plot(own.pseudo_r, own.pseudo_l, 's', **look)
+        for limit in (limits.min, limits.max):
             axes.axhline(limit, color=SURFACE_COLOUR, lw=0.8, ls=':')
         axes.set_yscale('log')
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -117,7 +117,7 @@ def test_clouds_with_nothing_to_see(tmp_path, points):
     for truth in (result.label, None):
         plot_scan_view(points, result.label, path, r'$\nothing _ %', truth=truth)
         assert imread(path).ndim == 3
-        plot_segment(result, Config(), points, [SEGMENT], path, truth, title=r'$\none _ %')
+        plot_segment(result, points, [SEGMENT], path, truth, title=r'$\none _ %')
         assert imread(path).ndim == 3
     assert [*tmp_path.iterdir()] == [path]
 
@@ -209,34 +209,25 @@ def test_what_is_drawn_is_the_result():
     above, below = Figure().subplots(2)
     view = SegmentView(result, SEGMENT, points[:, 2])
     view.draw_ground(above)
-    view.draw_length_scale(below, Config())
+    view.draw_length_scale(below)
 
     drawn = {line.get_label(): line for line in above.lines}
-    inside = slice(*result.candidates.offsets[SEGMENT : SEGMENT + 2])
-    own = result.candidates.where(result.candidates.segment == SEGMENT)
-    r, z = own.r, own.z + result.relief.at(own.x, own.y)
-    inlier = result.surface.inlier[inside]
+    own, inside = result.segment(SEGMENT), result.candidates.segment == SEGMENT
     begins = np.flatnonzero(np.diff(result.lines.line[inside])) + 1
     assert len(begins) > 0
-    np.testing.assert_array_equal(drawn['critical points'].get_xdata(), r[begins])
-    np.testing.assert_array_equal(drawn['candidates, inliers'].get_ydata(), z[inlier])
-    knots, n_segments = result.surface.knots, result.grid.n_segments
-    surface = result.surface.mean + result.relief.at_knots(knots, n_segments)
-    assert not result.relief.is_level
-    np.testing.assert_array_equal(drawn['surface'].get_ydata(), surface[SEGMENT])
+    np.testing.assert_array_equal(drawn['critical points'].get_xdata(), own.r[begins])
+    np.testing.assert_array_equal(drawn['candidates, inliers'].get_ydata(), own.z[own.inlier])
+    np.testing.assert_array_equal(drawn['surface'].get_ydata(), own.mean)
     # A line over the relief ends where its first and its last candidate are, nearly.
     lines = [line for line in above.lines if len(line.get_xdata()) == 16]
     assert len(lines) > 1
     for line in lines:
-        ends = np.interp(line.get_xdata()[[0, -1]], r, z)
+        ends = np.interp(line.get_xdata()[[0, -1]], own.r, own.z)
         np.testing.assert_allclose(line.get_ydata()[[0, -1]], ends, atol=0.15)
 
     length_scale, pseudo, *_ = (line.get_data() for line in below.lines)
-    np.testing.assert_array_equal(length_scale[1], np.exp(result.log_length_scale[SEGMENT]))
-    own = slice(*result.pseudo.offsets[SEGMENT : SEGMENT + 2])
-    np.testing.assert_array_equal(pseudo[0], result.pseudo.r_bar[own])
-    values = np.exp(result.pseudo.log_extent[own])
-    np.testing.assert_allclose(pseudo[1], values * result.fit.theta['length_scale_factor'])
+    np.testing.assert_array_equal(length_scale[1], own.length_scale)
+    np.testing.assert_array_equal(pseudo, [own.pseudo_r, own.pseudo_l])
     # The curve follows the pseudo-inputs: it stays among them and near each.
     off = np.abs(np.log(np.interp(pseudo[0], *length_scale) / pseudo[1]))
     assert off.mean() < 0.5 and off.max() < 1.0

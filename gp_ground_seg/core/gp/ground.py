@@ -79,10 +79,7 @@ def estimate_surface(
         At the candidates [log m].
     """
     candidates, knots, slope_std = frame.candidates, frame.knots, config.observation.slope_std
-    if config.length_scale.model == 'latent':
-        u, knot_u = latent_log_length_scales(frame, theta)
-    else:
-        u, knot_u = given_log_length_scales(frame, config.length_scale)
+    u, knot_u = log_length_scales(frame, theta, config)
     z = candidates.z - frame.prior_mean
     sill, gate_noise = variances_of(theta)
     largest = prior_variance(sill, slope_std, candidates.r.max(initial=0.0))
@@ -113,6 +110,15 @@ def estimate_surface(
         mean, std = combined_surface(mean, std, prior, *evidence())
         mean[np.isnan(knot_u)] = std[np.isnan(knot_u)] = np.nan
     return GroundSurface(knots, mean + frame.prior_mean, std, by_itself.inlier), knot_u, u
+
+
+def log_length_scales(
+    frame: Frame, theta: FloatArray, config: Config
+) -> tuple[FloatArray, FloatArray]:
+    """Log length-scales at the candidates and knots by the model; as `latent_log_length_scales`."""
+    if config.length_scale.model == 'latent':
+        return latent_log_length_scales(frame, theta)
+    return given_log_length_scales(frame, config.length_scale)
 
 
 OBSTACLE_DEPTH = 1.0
@@ -198,6 +204,33 @@ def _count_near(candidates: Candidates, reach: float) -> IntArray:
         number[n:] += is_near
         number[:-n] += is_near
     return number
+
+
+def posterior_covariance(
+    frame: Frame, theta: FloatArray, config: Config, surface: GroundSurface, m: int
+) -> FloatArray:
+    """Covariance of the heights of segment m at its first n knots, (n, n) [m^2].
+
+    n knots of the segment have a height. Correlations are those of its own process given its
+    inliers (paper, eq. 7), variances those of `surface`: its neighbours make these smaller, and
+    doubt of an inlier larger.
+    """
+    candidates, n = frame.candidates, int(np.isfinite(surface.mean[m]).sum())
+    own = np.flatnonzero(surface.inlier & (candidates.segment == m))
+    u, knot_u = log_length_scales(frame, theta, config)
+    r = np.concatenate([candidates.r[own], frame.knots[:n]])
+    l = np.exp(np.concatenate([u[own], knot_u[m, :n]]))  # noqa: E741
+    sill, noise = variances_of(theta)
+    prior = paciorek(r[:, None], l[:, None], r, l, sill)
+    prior += config.observation.slope_std**2 * np.outer(r, r)
+    if config.label.rule == 'roughness':
+        noise = noise_among(_count_near(candidates, np.exp(theta[3]))[own], noise)
+    given, cross = prior[: len(own), : len(own)] + np.eye(len(own)) * noise, prior[: len(own)]
+    cov = prior - cross.T @ np.linalg.solve(given, cross)
+    cov = cov[len(own) :, len(own) :]
+    scale = surface.std[m, :n] / np.sqrt(np.diag(cov))
+    result: FloatArray = cov * np.outer(scale, scale)
+    return result
 
 
 @shared
