@@ -12,7 +12,7 @@ from PIL import Image
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.cli.demo import simulated_drive
 from gp_ground_seg.core.errors import in_thousands
-from gp_ground_seg.lab.plotting import plot_scan_view
+from gp_ground_seg.lab.plotting import CAMERA, plot_scan_view
 
 N_SCANS, PERIOD = 30, 100
 """Number of scans, and the time that each is shown [ms]: as fast as the drive."""
@@ -28,7 +28,7 @@ def main(path: str) -> int:
         for points, _, _ in simulated_drive(N_SCANS):
             label = segmenter.segment(points).label
             n_points, n_ground = n_points + len(label), n_ground + np.sum(label == Label.GROUND)
-            plot_scan_view(points, label, still)
+            plot_scan_view(points, label, still, camera=CAMERA)
             with Image.open(still) as picture:
                 small = picture.convert('RGB').reduce(round(picture.width / WIDTH))
             pictures.append(small.quantize(N_COLOURS))

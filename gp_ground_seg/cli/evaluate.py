@@ -60,18 +60,18 @@ EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08 --json scores.json
   gp-ground-seg evaluate KITTI_ROOT --config my.yaml --against default
   gp-ground-seg evaluate KITTI_ROOT --set faces.max_normal_z=0 --against default
-  gp-ground-seg evaluate drive.mcap --config my.yaml --against default      no labels
+  gp-ground-seg evaluate drive.mcap --config my.yaml --against default
   gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
   gp-ground-seg evaluate KITTI_ROOT --workers 8
 
-KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI). With --workers
-the scores are the same; the times are not, because frames are computed at the same time.
+KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label}. With --workers
+scores are the same; times are not: frames are computed at the same time.
 """
 
 EXPERIMENT_EXAMPLES = """\
   gp-ground-seg experiment ablation KITTI_ROOT
   gp-ground-seg experiment scenes --sensors vlp-16 --scenes kerb
-  gp-ground-seg experiment NAME --help          describes one of them
+  gp-ground-seg experiment NAME --help   describes one of them
 """
 
 PEER = 'pypatchworkpp'
@@ -159,7 +159,7 @@ def _add_experiments(subparsers: argparse._SubParsersAction[argparse.ArgumentPar
                 ('--sensors', SENSORS, experiment.sensors),
                 ('--scenes', SCENES, experiment.scenes),
             ):
-                text = f'some of {",".join(known)} (default: {",".join(default)})'
+                text = f'some of {", ".join(known)} (default: {", ".join(default)})'
                 kind = {'metavar': 'LIST', 'type': options.some_of(known)}
                 options.add(child, (option, text, kind))
         options.add(child, options.MARKDOWN, options.TO_JSON, options.FORCE)

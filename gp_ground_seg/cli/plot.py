@@ -10,7 +10,13 @@ from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.semantic_kitti import read_labels
-from gp_ground_seg.lab.plotting import CAMERA, Place, camera_at, plot_scan_view, plot_segment
+from gp_ground_seg.lab.plotting import (
+    Place,
+    camera_at,
+    plot_scan_view,
+    plot_segment,
+    words_of_pose,
+)
 from gp_ground_seg.lab.scoring.metrics import true_labels
 
 SCAN = """\
@@ -20,7 +26,7 @@ false ground purple.
 SCAN_EXAMPLES = """\
   gp-ground-seg plot scan drive.mcap --frame 20 -o scan.png
   gp-ground-seg plot scan 000000.bin --camera 90,30,40 -o from_the_left.svg
-  gp-ground-seg plot scan velodyne/000000.bin --labels labels/000000.label -o errors.png
+  gp-ground-seg plot scan 000000.bin --labels 000000.label -o errors.png
 """
 SEGMENT = """\
 The paper's Figure 1 for any scan and segment, or two side by side: points, ground
@@ -45,9 +51,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     pictures = parser.add_subparsers(metavar='PICTURE', required=True, dest='picture')
     scan = options.new_parser(pictures, 'scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective')
     scan.add_argument(
-        '--camera', metavar='AZIMUTH,ELEVATION,DISTANCE', type=camera, default=CAMERA,
+        '--camera', metavar='AZIMUTH,ELEVATION,DISTANCE', type=camera, 
         help='where it stands, seen from the middle of the scene: counter-clockwise from ahead '
-        'within 360 deg, upwards within 89 deg, 1 to 1000 m away (default: 196,24,32)',
+        'within 360 deg, upwards within 89 deg, 1 to 1000 m away (default: 196,24 and as near '
+        'as the cloud is small)',
     )  # fmt: skip
     segment = options.new_parser(
         pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, 'a segment from the side'
@@ -91,7 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
         said = plot_scan_view(points, result.label, path, title, arguments.camera, truth=truth)
     else:
         said = plot_segment(result, points, arguments.segment, path, truth, title)
-    print(f'{said}, written to {shown(path)}')
+    print(f'sensor: {words_of_pose(result.pose)}', f'{said}, written to {shown(path)}', sep='\n')
     options.note_spared(config, used)
     return 0
 

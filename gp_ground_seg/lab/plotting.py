@@ -19,6 +19,7 @@ import numpy.typing as npt
 from gp_ground_seg.core.errors import in_thousands, require
 from gp_ground_seg.core.frame import OUTSIDE, BoolArray, FloatArray, Label
 from gp_ground_seg.core.pipeline.points import take_points
+from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.files import staged_file, writing
 from gp_ground_seg.lab.scoring.metrics import Labels, count_labels, label_ratios
@@ -56,6 +57,8 @@ CLOSEST = 1.0
 CAMERA, TARGET = (-16.0, -7.0, 10.0), (12.0, 1.0, -3.0)
 ZOOM = 0.75
 """Focal length over the width of the picture."""
+REACH = 25.0
+"""Range within which nine tenths of the points of a street are [m]: the camera suits these."""
 
 Place = tuple[float, float, float]
 Layers = dict[str, BoolArray]
@@ -67,17 +70,19 @@ def plot_scan_view(
     label: Labels,
     path: str | Path,
     title: str = '',
-    camera: Place = CAMERA,
+    camera: Place | None = None,
     *,
     truth: Labels | None = None,
 ) -> str:
     """Draw a scan in perspective, replacing the file `path`; return numbers of points.
 
     Ground and obstacles of `points`, (N, >=3) [m], by their `Label`; with the true labels, UNKNOWN
-    where a point does not count, the errors too. `camera` is in the sensor frame [m]. In a PDF
-    or SVG points are pixels.
+    where a point does not count, the errors too. `camera` is in the sensor frame [m]; without one,
+    it comes as near as the cloud is small. In a PDF or SVG points are pixels.
     """
     xyz = take_points(points).astype(np.float64)
+    if camera is None:  # a cloud that is enlarged looks as from nearby
+        xyz, camera = xyz * max(1.0, REACH / _usual_reach(xyz)), CAMERA
     said, layers = label_layers(label, truth)
     figure, foot = new_figure(WIDTH, HEIGHT + FOOT), FOOT / (HEIGHT + FOOT)
     axes = figure.add_axes((0.0, foot, 1.0, 1.0 - foot))
@@ -100,6 +105,20 @@ def plot_scan_view(
     figure.legend(loc='lower left', fontsize=11, frameon=False, ncols=4)
     save(figure, path)
     return said
+
+
+def _usual_reach(xyz: FloatArray) -> float:
+    """Return the horizontal range within which nine tenths of the points are [m]."""
+    reach = np.hypot(*xyz[np.isfinite(xyz).all(axis=1), :2].T)
+    return float(np.quantile(reach, 0.9)) or REACH if len(reach) else REACH
+
+
+def words_of_pose(pose: SensorPose) -> str:
+    """Return the height and tilt that were used, and whether they were estimated."""
+    source = 'estimated' if pose.height_estimated else 'given'
+    height = f'{pose.height:.2f} m over the ground'
+    tilt = 'level' if pose.is_level else f'roll {pose.roll:.3f}, pitch {pose.pitch:.3f} rad'
+    return f'{height} ({"assumed" if pose.is_height_default else source}), {tilt}'
 
 
 def camera_at(azimuth: float, elevation: float, distance: float) -> Place:
