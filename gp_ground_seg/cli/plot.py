@@ -98,6 +98,8 @@ def run(arguments: argparse.Namespace) -> int:
         said = plot_scan_view(points, result.label, path, title, arguments.camera, truth=truth)
     else:
         said = plot_segment(result, points, arguments.segment, path, truth, title)
+    for line in result.pose.contradictions:
+        options.note(line)
     print(f'sensor: {words_of_pose(result.pose)}', f'{said}, written to {shown(path)}', sep='\n')
     options.note_spared(config, used)
     return 0

@@ -86,25 +86,29 @@ def plot_scan_view(
     said, layers = label_layers(label, truth)
     figure, foot = new_figure(WIDTH, HEIGHT + FOOT), FOOT / (HEIGHT + FOOT)
     axes = figure.add_axes((0.0, foot, 1.0, 1.0 - foot))
-    axes.set_axis_off()
-    axes.set_xlim(-0.5, 0.5)
-    axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
     figure.text(
         0.5, 0.96, title, ha='center', parse_math=False, fontsize=14, backgroundcolor='white'
     )
+    draw_scan(axes, xyz, layers, camera)
+    figure.legend(loc='lower left', fontsize=11, frameon=False, ncols=4)
+    save(figure, path)
+    return said
+
+
+def draw_scan(axes: Any, xyz: FloatArray, layers: Layers, camera: Place, dot: float = 1.0) -> None:
+    """Draw layers of points (N, 3) in perspective; the least area of a dot is `dot`."""
+    axes.set_axis_off()
+    axes.set_xlim(-0.5, 0.5)
+    axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
     place, depth = project(xyz, camera)
     for name, layer in layers.items():
         chosen = np.flatnonzero(layer & (depth > CLOSEST))
         chosen = chosen[np.argsort(-depth[chosen])]  # far points first
-        axes.scatter(
-            *place[chosen].T, s=np.clip(60.0 / depth[chosen], 1.0, 5.0), linewidths=0.0,
-            rasterized=True, c=COLOURS[name],
-        )  # fmt: skip
+        size = np.clip(60.0 * dot / depth[chosen], dot, 5.0 * dot)
+        look = {'linewidths': 0.0, 'rasterized': True, 'c': COLOURS[name]}
+        axes.scatter(*place[chosen].T, s=size, **look)
         # Dots as small as in the picture would show no colour in the legend.
         axes.plot([], [], 'o', markersize=7, color=COLOURS[name], label=name)
-    figure.legend(loc='lower left', fontsize=11, frameon=False, ncols=4)
-    save(figure, path)
-    return said
 
 
 def _usual_reach(xyz: FloatArray) -> float:

@@ -326,7 +326,7 @@ class Tuner:
             for parameter, (slider, automatic) in self._automatic.items():
                 if automatic.value:
                     slider.value = round(getattr(result.pose, parameter.split('.')[1]), 3)
-        return '\n'.join(result.warnings)
+        return '\n'.join((*result.warnings, *result.pose.contradictions))
 
 
 def _tell(place: Any, action: Callable[[], str | None]) -> None:
