@@ -154,7 +154,7 @@ def trimmed(table: str, dropped: Sequence[str] = (), wanted: str = '') -> str:
 def body_of(figure: Figure, output: str, commit: str, *, is_last: bool = True) -> str:
     """Write what stands between the comments; the last tables of a page say the machine."""
     if 'picture' in figure.options:
-        # The image, with the words it had, and the line that names the file. Comments hold the rest.
+        # The image, with the words it had, and the line that names the file.
         made = figure.options['picture'].partition(' -> ')[0]
         (image,) = re.findall(r'^!\[.*\)$', figure.body, re.MULTILINE)
         (said,) = [line for line in output.splitlines() if made in line]

@@ -38,7 +38,9 @@ def main(total: float, what: list[str]) -> int:
                 said = now
             done += float(size[1]) * MEGABYTES.get(size[2], 1e-6)
     # Hard links of a cache count once, as in du.
-    files = {(s.st_dev, s.st_ino): s.st_blocks for s in map(Path.lstat, Path(sys.prefix).rglob('*'))}
+    files = {
+        (s.st_dev, s.st_ino): s.st_blocks for s in map(Path.lstat, Path(sys.prefix).rglob('*'))
+    }
     size = 512e-6 * sum(files.values())
     print(f'  {done:.0f} MB downloaded, {size:.0f} MB in {Path(sys.prefix).name}', flush=True)
     return pip.returncode

@@ -51,7 +51,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     pictures = parser.add_subparsers(metavar='PICTURE', required=True, dest='picture')
     scan = options.new_parser(pictures, 'scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective')
     scan.add_argument(
-        '--camera', metavar='AZIMUTH,ELEVATION,DISTANCE', type=camera, 
+        '--camera', metavar='AZIMUTH,ELEVATION,DISTANCE', type=camera,
         help='where it stands, seen from the middle of the scene: counter-clockwise from ahead '
         'within 360 deg, upwards within 89 deg, 1 to 1000 m away (default: 196,24 and as near '
         'as the cloud is small)',

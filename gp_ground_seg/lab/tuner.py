@@ -288,9 +288,8 @@ class Tuner:
             return lambda: slider.value
         automatic = gui.add_checkbox(f'{spec.name} = {AUTO}', now == AUTO)
         automatic.on_update(lambda _event: setattr(slider, 'disabled', automatic.value))
-        # A slider that only shows what was estimated changes nothing.
-        slider.on_update(lambda _event: automatic.value or self._changed.set())
-        self._watch(automatic)
+        # Setting the slider to what was estimated segments once more, to the same result.
+        self._watch(slider, automatic)
         self._automatic[spec.name] = slider, automatic
         return lambda: AUTO if automatic.value else slider.value
 
@@ -325,7 +324,8 @@ class Tuner:
             self._table.content = _table(result, before.label, (sums, sums_before))
             for parameter, (slider, automatic) in self._automatic.items():
                 if automatic.value:
-                    slider.value = round(getattr(result.pose, parameter.split('.')[1]), 3)
+                    value = round(getattr(result.pose, parameter.split('.')[1]), 3)
+                    slider.value = min(max(value, slider.min), slider.max)
         return '\n'.join((*result.warnings, *result.pose.contradictions))
 
 

@@ -119,7 +119,9 @@ def test_a_segment_is_as_in_the_paper_in_the_frame_of_the_sensor():
     np.testing.assert_allclose(own.length_scale, np.exp(knot_u), rtol=1e-4)
     l_bar = np.exp(result.pseudo.log_extent) * theta[5 + result.pseudo.kind]
     bar = slice(*result.pseudo.offsets[90:92])
-    np.testing.assert_allclose([own.pseudo_r, own.pseudo_l], [result.pseudo.r_bar[bar], l_bar[bar]])
+    np.testing.assert_allclose(
+        [own.pseudo_r, own.pseudo_l], [result.pseudo.r_bar[bar], l_bar[bar]]
+    )
     with pytest.raises(ConfigError, match=r'segment 180: must be in \[0, 179\]'):
         result.segment(180)
     # Over a relief, with neighbours, doubts and tilt: still the points' heights and one posterior.

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.lab import plotting
 from gp_ground_seg.lab.plotting import (
     CAMERA,

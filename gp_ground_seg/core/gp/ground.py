@@ -115,7 +115,7 @@ def estimate_surface(
 def log_length_scales(
     frame: Frame, theta: FloatArray, config: Config
 ) -> tuple[FloatArray, FloatArray]:
-    """Log length-scales at the candidates and knots by the model; as `latent_log_length_scales`."""
+    """Log length-scales by the model; returns as `latent_log_length_scales`."""
     if config.length_scale.model == 'latent':
         return latent_log_length_scales(frame, theta)
     return given_log_length_scales(frame, config.length_scale)

@@ -247,8 +247,8 @@ class LabelConfig(ParameterGroup):
         'roughness = ground up to ground_tolerance, or higher where the ground about it is rough; '
         'returns at one height then vote; tolerance = ground_tolerance alone, above and below')
     ground_tolerance: float = basic(0.1, (0.001, 5.0),
-        'height above the surface up to which a return is ground; in proportion to the height of a '
-        'sensor below 1 m; larger: kerbs and grass become ground, low objects too, and other '
+        'height above the surface up to which a return is ground; in proportion to the height of '
+        'a sensor below 1 m; larger: kerbs and grass become ground, low objects too, and other '
         'returns count as vertical faces', 'm', 'zeta_g')
     obstacle_min_height: float = advanced(0.2, (0.01, 10.0),
         'least height over the ground of an obstacle that matters: on rough ground, a vertical '
