@@ -10,13 +10,7 @@ from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.semantic_kitti import read_labels
-from gp_ground_seg.lab.plotting import (
-    Place,
-    camera_at,
-    plot_scan_view,
-    plot_segment,
-    words_of_pose,
-)
+from gp_ground_seg.lab import plotting
 from gp_ground_seg.lab.scoring.metrics import true_labels
 
 SCAN = """\
@@ -95,12 +89,14 @@ def run(arguments: argparse.Namespace) -> int:
     used = options.spare_compiling(config, 1)
     result = GroundSegmenter(used).segment(points)
     if arguments.picture == 'scan':
-        said = plot_scan_view(points, result.label, path, title, arguments.camera, truth=truth)
+        view = points, result.label, path, title, arguments.camera
+        said = plotting.plot_scan_view(*view, truth=truth)
     else:
-        said = plot_segment(result, points, arguments.segment, path, truth, title)
+        said = plotting.plot_segment(result, points, arguments.segment, path, truth, title)
     for line in result.pose.contradictions:
         options.note(line)
-    print(f'sensor: {words_of_pose(result.pose)}', f'{said}, written to {shown(path)}', sep='\n')
+    print(f'sensor: {plotting.words_of_pose(result.pose)}')
+    print(f'{said}, written to {shown(path)}')
     options.note_spared(config, used)
     return 0
 
@@ -110,9 +106,9 @@ def numbers(text: str) -> list[int]:
     return [int(word) for word in text.split(',')]
 
 
-def camera(text: str) -> Place:
+def camera(text: str) -> plotting.Place:
     """Read azimuth, elevation and distance; straight from above no side of a picture is up."""
     azimuth, elevation, distance = map(float, text.split(','))
     if not (abs(azimuth) <= 360.0 and abs(elevation) <= 89.0 and 1.0 <= distance <= 1000.0):
         raise ValueError
-    return camera_at(azimuth, elevation, distance)
+    return plotting.camera_at(azimuth, elevation, distance)

@@ -115,32 +115,27 @@ class Segment(NamedTuple):
 
     Ranges are horizontal distances from the sensor; heights are over it, along the vertical, which
     is the sensor's z axis where ``pose`` has no tilt.
-
-    Attributes
-    ----------
-    r, z, inlier : (C,) float64, float64, bool
-        Range and height of each ground candidate [m], and whether the surface rests on it.
-    pseudo_r, pseudo_l : (P,) float64
-        Range of each pseudo-input, and its length-scale L-bar [m]; empty without a latent process.
-    knots : (K,) float64
-        Ranges at which the ground is predicted [m]; none where there is no model.
-    mean, std : (K,) float64
-        Height of the ground at the knots, and its standard deviation [m].
-    cov : (K, K) float64
-        Posterior covariance of these heights [m^2]; its diagonal is ``std**2``.
-    length_scale : (K,) float64
-        Length-scale of the kernel at the knots [m].
     """
 
+    #: (C,) horizontal range of each ground candidate [m]
     r: FloatArray
+    #: (C,) its height [m]
     z: FloatArray
+    #: (C,) whether the surface rests on it
     inlier: BoolArray
+    #: (P,) range of each pseudo-input [m]; none without a latent process
     pseudo_r: FloatArray
+    #: (P,) its length-scale, L-bar [m]
     pseudo_l: FloatArray
+    #: (K,) ranges at which the ground is predicted [m]; none where there is no model
     knots: FloatArray
+    #: (K,) height of the ground there [m]
     mean: FloatArray
+    #: (K,) its standard deviation [m]
     std: FloatArray
+    #: (K, K) posterior covariance of these heights [m^2], with ``std**2`` in the diagonal
     cov: FloatArray
+    #: (K,) length-scale of the kernel there [m]
     length_scale: FloatArray
 
 

@@ -178,7 +178,7 @@ LINE_COLOUR, SURFACE_COLOUR, PSEUDO_INPUT_COLOUR = GREEN, '#111111', VIOLET
 
 # Metres kept free below and above the ground, and beyond the last candidate.
 BELOW, ABOVE, BEYOND = 0.4, 0.9, 2.0
-N_OF_LINE = 16  # places at which a line is drawn over the relief
+N_OF_LINE, STEEPEST = 16, 1e6  # places at which a line is drawn over the relief; slope of a wall
 
 
 def plot_segment(
@@ -251,11 +251,6 @@ class SegmentView:
             f'{len(own.pseudo_r)} pseudo-inputs'
         )
 
-    def _relief(self, r: FloatArray) -> FloatArray:
-        """Height of the relief at ranges (K,) in the middle of the segment, (K,) [m]."""
-        heights = self._result.relief.at_knots(r, self._result.grid.n_segments)
-        return np.asarray(heights[self._segment])
-
     def reach(self) -> float:
         """Return the range that holds all candidates, or if none all points [m]."""
         r = self._own.r if len(self._own.r) else self.r
@@ -298,13 +293,15 @@ class SegmentView:
         first, last = candidates.offsets[self._segment : self._segment + 2]
         numbers = np.unique(lines.line[first:last])
         look = {'color': LINE_COLOUR, 'lw': 3.2, 'alpha': 0.75, 'zorder': 4, 'label': 'lines'}
-        share = np.linspace(0.0, 1.0, N_OF_LINE)
         for q in numbers:
             points = slice(lines.start[q], lines.start[q + 1])
             if points.stop - points.start > 1:
-                ends = line_ends(candidates.r[points], candidates.z[points], float(lines.slope[q]))
-                r, z = (a + share * (b - a) for a, b in ends)
-                axes.plot(r, z + self._relief(r), **look)
+                own_r, own_z = candidates.r[points], candidates.z[points]
+                r = np.linspace(own_r[0], own_r[-1], N_OF_LINE)
+                slope = np.clip(lines.slope[q], -STEEPEST, STEEPEST)
+                z = np.clip(own_z.mean() + slope * (r - own_r.mean()), own_z.min(), own_z.max())
+                relief = self._result.relief.at_knots(r, self._result.grid.n_segments)
+                axes.plot(r, z + relief[self._segment], **look)
                 look['label'] = None  # one entry in the legend for all
         critical = lines.start[numbers[1:]] - first
         axes.plot(
@@ -328,11 +325,3 @@ class SegmentView:
         axes.yaxis.set_major_formatter('{x:g}')
         axes.set_xlabel('horizontal range r [m]')
         axes.set_ylabel('length-scale l [m]')
-
-
-def line_ends(r: FloatArray, z: FloatArray, slope: float) -> tuple[FloatArray, FloatArray]:
-    """Return range and height, (2,) each, of the ends of a line through points (n,) [m]."""
-    angle = math.atan(slope)
-    along = (r - r.mean()) * math.cos(angle) + (z - z.mean()) * math.sin(angle)
-    ends = np.array([along.min(), along.max()])
-    return r.mean() + ends * math.cos(angle), z.mean() + ends * math.sin(angle)
