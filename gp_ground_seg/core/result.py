@@ -117,26 +117,16 @@ class Segment(NamedTuple):
     is the sensor's z axis where ``pose`` has no tilt.
     """
 
-    #: (C,) horizontal range of each ground candidate [m]
-    r: FloatArray
-    #: (C,) its height [m]
-    z: FloatArray
-    #: (C,) whether the surface rests on it
-    inlier: BoolArray
-    #: (P,) range of each pseudo-input [m]; none without a latent process
-    pseudo_r: FloatArray
-    #: (P,) its length-scale, L-bar [m]
-    pseudo_l: FloatArray
-    #: (K,) ranges at which the ground is predicted [m]; none where there is no model
-    knots: FloatArray
-    #: (K,) height of the ground there [m]
-    mean: FloatArray
-    #: (K,) its standard deviation [m]
-    std: FloatArray
-    #: (K, K) posterior covariance of these heights [m^2], with ``std**2`` in the diagonal
-    cov: FloatArray
-    #: (K,) length-scale of the kernel there [m]
-    length_scale: FloatArray
+    r: FloatArray  #: (C,) horizontal range of each ground candidate [m]
+    z: FloatArray  #: (C,) its height [m]
+    inlier: BoolArray  #: (C,) whether the surface rests on it
+    pseudo_r: FloatArray  #: (P,) range of each pseudo-input [m]; none without a latent process
+    pseudo_l: FloatArray  #: (P,) its length-scale, L-bar [m]
+    knots: FloatArray  #: (K,) ranges at which the ground is predicted [m]; none without a model
+    mean: FloatArray  #: (K,) height of the ground there [m]
+    std: FloatArray  #: (K,) its standard deviation [m]
+    cov: FloatArray  #: (K, K) posterior covariance of these heights; its diagonal is ``std**2``
+    length_scale: FloatArray  #: (K,) length-scale of the kernel there [m]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
