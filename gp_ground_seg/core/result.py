@@ -149,8 +149,8 @@ class Segmentation:
     grid, frame, surface
         Intermediate results, for plots and diagnostics; in the level frame. `surface` is the
         process's own, which the labels follow from; `corrected` is what users are given.
-    log_length_scale : (M, knots) float64
-        Log length-scale at the knots of the surface [log m]; NaN in segments
+    log_length_scale : (M, K) float64
+        Log length-scale at the K knots of the surface [log m]; NaN in segments
         without candidates.
     pose : SensorPose
         Height and tilt of the sensor that were used, and what the scan says of them;
