@@ -286,7 +286,7 @@ class Tuner:
         if not spec.auto:
             self._watch(slider)
             return lambda: slider.value
-        automatic = gui.add_checkbox(f'{spec.name} = {AUTO}', now == AUTO)
+        automatic = gui.add_checkbox(AUTO, now == AUTO, hint=f'{spec.name} = {AUTO}')
         automatic.on_update(lambda _event: setattr(slider, 'disabled', automatic.value))
         # Setting the slider to what was estimated segments once more, to the same result.
         self._watch(slider, automatic)

@@ -90,6 +90,9 @@ def test_labels_and_errors_are_where_the_points_are(tmp_path):
         centre, n = where(tmp_path / 'a.png', COLOURS[name])
         assert n > 300
         np.testing.assert_allclose(centre, project(np.array([x, y, -1.75]))[0], atol=0.01)
+    # A room is drawn as large as a street.
+    plot_scan_view(0.1 * points, label, tmp_path / 'a.png', truth=truth)
+    assert all(where(tmp_path / 'a.png', COLOURS[name])[1] > 300 for name in places)
     # Without the truth, and from above.
     above = camera_at(0, 89, 60)
     plot_scan_view(points, label, tmp_path / 'a.png', camera=above)
