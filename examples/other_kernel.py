@@ -5,9 +5,11 @@ Put a kernel of your own into KERNEL.
 """
 
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, WhiteKernel
 
@@ -22,6 +24,8 @@ LEAST = 4
 def main(scan, preset='default'):
     """Print root mean squares over all segments [m]."""
     result = GroundSegmenter(preset).segment(list_inputs(Path(scan))[0].read().xyz)
+    # Few inliers leave a parameter at its bound.
+    warnings.filterwarnings('ignore', category=ConvergenceWarning)
     rows = []
     for m in range(result.grid.n_segments):
         ground = result.segment(m)
