@@ -44,17 +44,9 @@ from gp_ground_seg.lab.scoring.tables import (
     peer_note,
     time_tables,
 )
-from gp_ground_seg.lab.simulation import (
-    DRIVES,
-    LOW,
-    PLACES,
-    SCENES,
-    SENSORS,
-    STEEP,
-    Kind,
-    simulate_scan,
-)
+from gp_ground_seg.lab.simulation import LOW, PLACES, SCENES, SENSORS, STEEP, Kind, simulate_scan
 from gp_ground_seg.lab.simulation.objects import object_heights
+from gp_ground_seg.lab.simulation.scenes import DRIVES
 
 if TYPE_CHECKING:
     from pandas import DataFrame

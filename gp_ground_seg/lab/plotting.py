@@ -82,7 +82,9 @@ def plot_scan_view(
     """
     xyz = take_points(points).astype(np.float64)
     if camera is None:  # a cloud that is enlarged looks as from nearby
-        xyz, camera = xyz * max(1.0, REACH / _usual_reach(xyz)), CAMERA
+        reach = np.hypot(*xyz[np.isfinite(xyz).all(axis=1), :2].T)
+        usual = np.quantile(np.append(reach, REACH), 0.9)
+        xyz, camera = xyz * (REACH / np.clip(usual, CLOSEST, REACH)), CAMERA
     said, layers = label_layers(label, truth)
     figure, foot = new_figure(WIDTH, HEIGHT + FOOT), FOOT / (HEIGHT + FOOT)
     axes = figure.add_axes((0.0, foot, 1.0, 1.0 - foot))
@@ -109,12 +111,6 @@ def draw_scan(axes: Any, xyz: FloatArray, layers: Layers, camera: Place, dot: fl
         axes.scatter(*place[chosen].T, s=size, **look)
         # Dots as small as in the picture would show no colour in the legend.
         axes.plot([], [], 'o', markersize=7, color=COLOURS[name], label=name)
-
-
-def _usual_reach(xyz: FloatArray) -> float:
-    """Return the horizontal range within which nine tenths of the points are [m]."""
-    reach = np.hypot(*xyz[np.isfinite(xyz).all(axis=1), :2].T)
-    return float(np.quantile(reach, 0.9)) or REACH if len(reach) else REACH
 
 
 def words_of_pose(pose: SensorPose) -> str:
