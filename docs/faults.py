@@ -61,7 +61,7 @@ def main(path: str) -> int:
         axes = figure.add_axes(tuple(np.divide(place, (*size, *size))))
         draw_scan(axes, zoom * xyz + AHEAD * (zoom > 1.0), layers, CAMERA, 0.4)
         figure.text((left + 0.05) / size[0], (top - 0.2) / size[1], title, fontsize=10)
-        said.append(f'{title.split()[0]} {np.mean(label == 1):.1%}')
+        said.append(f'{title.split()[0]}: {100 * np.mean(label == 1):.1f} %')
     handles, names = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, names, loc='lower left', fontsize=9, frameon=False, ncols=3)
     save(figure, path)
