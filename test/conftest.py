@@ -129,6 +129,9 @@ def fewer(n: int, n_plain: int) -> int:
     return n if JIT_ENABLED else n_plain
 
 
+BACKENDS = NumpyBackend(), NumbaBackend()
+
+
 @pytest.fixture(scope='module', params=[NumpyBackend, NumbaBackend], ids=['numpy', 'numba'])
 def backend(request: pytest.FixtureRequest) -> Backend:
     """Each backend in turn."""

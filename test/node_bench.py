@@ -21,7 +21,7 @@ from gp_ground_seg.cli.demo import FRAME_ID, PERIOD, SPEED
 from gp_ground_seg.cli.options import progress
 from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_stamp
 from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
+from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab.scoring.report import describe_environment, machine_line
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 from gp_ground_seg.ros.node_process import INPUT, OUTPUTS, Link, NodeProcess, private_session
@@ -138,7 +138,7 @@ def read_scans(path, n_wanted, topic):
     """Points of the first scans of a KITTI folder, or of what `segment` takes."""
     if topic is None and any(path.glob('sequences/*/velodyne')):
         frames = labelled_frames(path)[:n_wanted]
-        return [read_points(frame.points_path, frame.columns) for frame in frames]
+        return [frame.points for frame in frames]
     inputs = list_inputs(path, 4, topic)
     clouds = [item.read().xyz for item in itertools.islice(inputs, n_wanted)]
     return [np.column_stack([xyz, np.ones(len(xyz))]).astype(np.float32) for xyz in clouds]

@@ -9,7 +9,7 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.files import check_writable
-from gp_ground_seg.data.semantic_kitti import read_labels
+from gp_ground_seg.data.semantic_kitti import read_entries
 from gp_ground_seg.lab import plotting
 from gp_ground_seg.lab.scoring.metrics import true_labels
 
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
         options.note(f'the first of {len(scans)} clouds, {scan.title}{others} ...: see --frame')
     points, title, truth = scan.read().xyz, shown(scan.title), None
     if arguments.labels is not None:
-        truth = true_labels(read_labels(arguments.labels, len(points)))
+        truth = true_labels(read_entries(arguments.labels, len(points)) & 0xFFFF)
     used = options.spare_compiling(config, 1)
     result = GroundSegmenter(used).segment(points)
     if arguments.picture == 'scan':

@@ -225,8 +225,8 @@ class Frame(NamedTuple):
     candidates: Candidates
     lines: Lines
     pseudo: PseudoInputs
-    # (C,) candidates that join the inliers if the one before them has joined
-    continues_line: BoolArray
+    # (C,) slope with which the ground goes on behind a candidate; -inf where it does not
+    onward: FloatArray
     in_face: BoolArray  # (C,) whether the tile of a candidate has a vertical face
     knots: FloatArray  # (K,) ranges where the surface is wanted [m], read-only
     prior_mean: float  # prior mean of the ground's height [m]

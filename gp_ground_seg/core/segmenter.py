@@ -171,11 +171,11 @@ class GroundSegmenter:
         relief, candidates = backend.find_relief(
             scan.candidates, faces, pose.sensor_height, config
         )
-        candidates, lines, pseudo, continues_line, in_face = backend.extract_lines(
+        candidates, lines, pseudo, onward, in_face = backend.extract_lines(
             candidates, faces, config
         )
         knots, prior_mean = scan.grid.edges, -pose.sensor_height
-        frame = Frame(candidates, lines, pseudo, continues_line, in_face, knots, prior_mean)
+        frame = Frame(candidates, lines, pseudo, onward, in_face, knots, prior_mean)
         timer.mark('lines')
         # 5. Observation and latent process: hyper-parameters theta, inliers and surface.
         is_fixed = config.learning.mode == 'fixed'

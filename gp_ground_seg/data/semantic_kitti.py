@@ -43,12 +43,17 @@ class Frame:
         return read_points(self.points_path, self.columns)
 
     @property
-    def semantic(self) -> npt.NDArray[np.uint16]:
-        """Class of each point, (N,); DataError without a file of labels that fits."""
+    def entries(self) -> npt.NDArray[np.uint32]:
+        """Entry of each point, as `read_entries`; DataError without a file of labels that fits."""
         if self.labels_path is None:
             raise DataError(f'{self.points_path}: has no labels')
         n_points = self.points_path.stat().st_size // (4 * self.columns)
-        return read_labels(self.labels_path, n_points)
+        return read_entries(self.labels_path, n_points)
+
+    @property
+    def semantic(self) -> npt.NDArray[np.uint16]:
+        """Class of each point, (N,); DataError as `entries`."""
+        return (self.entries & 0xFFFF).astype(np.uint16)
 
     @property
     def is_ground(self) -> BoolArray:
@@ -149,13 +154,11 @@ def read_points(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[n
     return four_columns(read_scan(path, columns))
 
 
-def read_labels(path: str | Path, n_points: int) -> npt.NDArray[np.uint16]:
-    """Semantic classes of a ``.label`` file, (n_points,); DataError if it has another number."""
-    return (read_entries(path, n_points) & 0xFFFF).astype(np.uint16)
-
-
 def read_entries(path: str | Path, n_points: int) -> npt.NDArray[np.uint32]:
-    """Entries of a ``.label`` file, (n_points,): class below, instance in the upper 16 bits."""
+    """Entries of a ``.label`` file, (n_points,): class below, instance in the upper 16 bits.
+
+    DataError if it cannot be read, or has another number.
+    """
     expected = f'expected {4 * n_points} for {n_points} points'
     data = read_bytes(path, 4 * n_points, expected)
     if len(data) != 4 * n_points:

@@ -5,7 +5,6 @@ The one module that imports distributed, an optional package.
 
 from __future__ import annotations
 
-import importlib.metadata
 import itertools
 import logging
 import multiprocessing
@@ -127,17 +126,6 @@ def cut(
         return [[*members] for _, members in itertools.groupby(items, key=group)]
     size = max(1, min(BLOCK_SIZE, -(-len(items) // (2 * max(1, n_workers)))))
     return [[*items[k : k + size]] for k in range(0, len(items), size)]
-
-
-def package_versions(*packages: str) -> dict[str, str | None]:
-    """Versions of what labels depend on, and of further `packages`; None: not installed."""
-    versions: dict[str, str | None] = {'gp_ground_seg': __version__}
-    for package in ('numpy', 'scipy', 'numba', *packages):
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = None
-    return versions
 
 
 def _compute_block(version: str, function: Function, block: Sequence[Any]) -> tuple[Any, _Notes]:

@@ -17,7 +17,7 @@ from gp_ground_seg.core.backend import make_backend
 from gp_ground_seg.core.errors import DataError, in_thousands
 from gp_ground_seg.core.frame import OUTSIDE, FloatArray, Label
 from gp_ground_seg.core.parameters.config import Config, find_preset
-from gp_ground_seg.data.semantic_kitti import Frame, read_points
+from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.lab.cluster import HERE, Runner
 from gp_ground_seg.lab.scoring.evaluate import (
     ALL,
@@ -304,8 +304,7 @@ def measure_speed(items: Sequence[Frame], config: Config, runner: Runner = HERE)
 
 def _points_of(frame: Frame) -> KnownScan:
     """Read the points alone: what is not scored leaves the caches as they are."""
-    points = read_points(frame.points_path, frame.columns)
-    return KnownScan(frame.sequence, frame.index, points)
+    return KnownScan(frame.sequence, frame.index, frame.points)
 
 
 # Simulated scenes: ours beside Patchwork++, and objects lost.

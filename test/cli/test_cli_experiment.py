@@ -8,8 +8,8 @@ from cli_runner import error_line, run
 from evaluation_samples import write_streets
 
 from gp_ground_seg.cli.evaluate import EXPERIMENTS
+from gp_ground_seg.data import semantic_kitti
 from gp_ground_seg.lab import cluster, experiments
-from gp_ground_seg.lab.scoring import evaluate as runner
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -109,7 +109,7 @@ REFUSED = {
 
 @pytest.mark.parametrize('case', REFUSED)
 def test_errors_are_said_before_any_frame_is_read(root, case, capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(runner, 'read_points', None)
+    monkeypatch.setattr(semantic_kitti, 'read_points', None)
     monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT', 0.5)
     monkeypatch.chdir(tmp_path)
     target = tmp_path / 'mine.bin'

@@ -214,19 +214,6 @@ def test_the_summary_has_height_and_tilt_of_the_sensor_and_what_they_contradict(
     )
 
 
-def test_a_scan_without_ground_is_named_on_stderr_and_never_a_silent_zero(tmp_path, capsys):
-    flat_beam = dataclasses.replace(SMALL, elevations=(0.0,))
-    points = simulate_scan(SCENES['urban'](1), flat_beam, np.random.default_rng(1)).points
-    (tmp_path / 'a.bin').write_bytes(points.astype('<f4').tobytes())
-    words = [tmp_path / 'a.bin', '--quiet', '-o', tmp_path / 'a.label']
-    assert segment(*words) == 0
-    said = capsys.readouterr()
-    assert 'no frame shows enough ground to estimate the height' in said.out
-    lines = said.err.splitlines()
-    assert [line for line in lines if 'does not show the ground' in line and '1.73 m' in line]
-    assert [line for line in lines if 'next to nothing of the scan is ground' in line]
-
-
 @pytest.mark.parametrize(('how', 'code'), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
 def test_a_stopped_run_leaves_the_old_bag(tmp_path, capsys, how, code):
     before = samples.write_ros2_bag(tmp_path / 'out')

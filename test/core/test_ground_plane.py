@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from conftest import fewer
+from conftest import BACKENDS, fewer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled import ground_plane as compiled
-from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.frame import Candidates
 from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import (
@@ -16,8 +14,6 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     N_SECTORS,
     solve_plane,
 )
-
-BACKENDS = NumpyBackend(), NumbaBackend()
 
 
 def random_candidates(seed, n_segments, n_bins, share):

@@ -1,13 +1,13 @@
-"""Lines, slope breaks and pseudo-inputs: both backends against loops, and one by one."""
+"""Lines, slope breaks and pseudo-inputs: both backends, those of the paper against loops."""
 
 import math
 
 import numpy as np
 import pytest
-from conftest import fewer
+from conftest import BACKENDS, fewer
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import Reference
+from reference import extract_lines, pseudo_inputs
 
 from gp_ground_seg import Config
 from gp_ground_seg.core.frame import Candidates, Faces
@@ -84,7 +84,7 @@ def draw_faces(seed):
     st.sampled_from([(1.0, 4, 3.0, 8.0), (0.2, 3, 9.0, 1.5), (10.0, 7, 1.0, 100.0)]),
 )
 def test_lines_and_pseudo_inputs_are_the_reference(
-    backend, seed, per, error_ratio, shared, bounds
+    compiled_code, seed, per, error_ratio, shared, bounds
 ):
     candidates, faces = draw_candidates(seed), draw_faces(seed)
     config = Config().replace(
@@ -97,16 +97,40 @@ def test_lines_and_pseudo_inputs_are_the_reference(
             'length_scale.max': 8.0,
         }
     )
-    found = backend.extract_lines(candidates, faces, config)
-    expected = Reference().extract_lines(candidates, faces, config)
-    for ours, theirs in zip(found[:3], expected[:3], strict=True):
-        for name, value in ours._asdict().items():
-            other = getattr(theirs, name)
-            assert value.dtype == other.dtype
-            np.testing.assert_allclose(value, other, rtol=1e-9, atol=1e-9, err_msg=name)
-    for ours, theirs in zip(found[3:], expected[3:], strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-    assert len(found[0].r) == (~faces.has_occluded_base[candidates.tile]).sum()
+    kept = candidates.where(~faces.has_occluded_base[candidates.tile])
+    lines = extract_lines(kept, config.lines)
+    found = [backend.extract_lines(candidates, faces, config) for backend in BACKENDS]
+    for of_backend in found:
+        by_loops = kept, lines, pseudo_inputs(kept, lines, config)
+        for ours, theirs in zip(of_backend[:3], by_loops, strict=True):
+            for name, value in ours._asdict().items():
+                other = getattr(theirs, name)
+                assert value.dtype == other.dtype
+                np.testing.assert_allclose(value, other, rtol=1e-9, atol=1e-9, err_msg=name)
+        np.testing.assert_array_equal(of_backend[3], found[0][3])
+        np.testing.assert_array_equal(of_backend[4], faces.is_face[kept.tile])
+
+
+# Heights of four candidates behind three of a level road, 4 m apart.
+RISE = np.array([0.2, 0.6, 1.0, 1.4])
+AHEAD = {
+    'a ramp': (RISE, True),
+    'a ramp that falls': (-RISE, True),
+    'a steep bank': (3.0 * RISE, False),
+    'a bonnet': (RISE + 0.8, False),
+    'a terrace': (np.full(4, 0.2), False),
+}
+
+
+@pytest.mark.parametrize('name', AHEAD)
+def test_a_slope_break_is_followed_and_a_step_is_not(backend, name):
+    ahead, is_followed = AHEAD[name]
+    candidates = candidates_of(5.0 + 4.0 * np.arange(7), np.append(np.zeros(3), ahead))
+    _, lines, _, continues, _ = backend.extract_lines(candidates, NO_FACES, Config())
+    assert list(lines.start) == [0, 3, 7]
+    assert continues[3] == is_followed
+    # The others of a flat line follow the one before them.
+    assert (continues[4:] == (name != 'a steep bank')).all()
 
 
 def test_a_candidate_far_below_changes_no_line_of_other_segments(backend):

@@ -1,55 +1,54 @@
 """The surface corrected by the returns called ground: its height and its standard deviations."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
-import reference
 from conftest import hilly_scan
-from hypothesis import given
-from hypothesis import strategies as st
 
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.core.frame import GroundSurface, Labelled, PolarGrid
 from gp_ground_seg.core.pipeline import residuals
-from gp_ground_seg.core.pipeline.residuals import correct_surface
+from gp_ground_seg.core.pipeline.residuals import PRIOR_CELLS, correct_surface
 from gp_ground_seg.lab.simulation import DRIVES, SENSORS, simulate_scan
 
 N_SEGMENTS = 7
 KNOTS = np.array([1.0, 2.0, 3.5, 5.0, 7.0, 10.0])
 
 
-def correct(cells, residuals, surface, noise=0.02, slope_std=0.05, find=correct_surface):
-    """Correct a surface of `N_SEGMENTS` by ground returns in some cells."""
-    cells, residuals = np.asarray(cells, np.int32), np.asarray(residuals, float)
-    label = np.full(len(cells), Label.GROUND, np.uint8)
-    grid = PolarGrid(cells, np.ones(len(cells)), KNOTS, N_SEGMENTS)
-    labelled = Labelled(label, residuals, residuals)
-    return find(surface, labelled, grid, noise, slope_std)
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(0, 60))
-def test_the_correction_is_the_reference(seed, n_returns):
-    rng = np.random.default_rng(seed)
-    cells = rng.integers(0, N_SEGMENTS * (len(KNOTS) - 1), n_returns)
-    residuals = np.round(rng.normal(0.01, 0.05, n_returns) * 2**20) / 2**20
-    shape = N_SEGMENTS, len(KNOTS)
-    mean, std = rng.normal(-1.7, 0.2, shape), rng.uniform(0.001, 0.1, shape)
-    # A segment has no model, and others none from some range on.
-    for m, end in enumerate(rng.integers(0, len(KNOTS) + 4, N_SEGMENTS)):
-        mean[m, end:] = std[m, end:] = np.nan
+def test_the_correction_by_hand():
+    """The formulas of the module, for knots that see two cells, one, and none."""
+    one, other, third = np.array([0.0, 0.02, 0.04]), np.array([0.1, 0.12]), np.array([0.05, 0.06])
+    own, noise, slope_std = 0.03, 0.02, 0.05
+    mean, std = np.full((2, N_SEGMENTS, len(KNOTS)), [[[-1.7]], [[own]]])
+    mean[2] = std[2] = np.nan
+    mean[4, 5] += 0.1
     surface = GroundSurface(KNOTS, mean, std, np.ones(0, bool))
-    found = correct(cells, residuals, surface)
-    values = np.array([found.correction, found.std, found.return_std])
-    finds = [partial(reference.correct_surface, takes_first=first) for first in (True, False)]
-    one, other = (np.array(correct(cells, residuals, surface, find=find)) for find in finds)
-    np.testing.assert_array_equal(np.isnan(one).any(axis=0), np.isnan(mean))
-    # The nearest of two knots that are equally far may be either.
-    is_one = np.isclose(values, one, rtol=0, atol=1e-7, equal_nan=True).all(axis=0)
-    np.testing.assert_allclose(np.where(is_one, one, other), values, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(found.mean, mean + found.correction, atol=1e-12)
-    assert (found.return_std >= found.std)[np.isfinite(mean)].all()
+    # Side by side in segments 0 and 1, and far away in segment 4.
+    grid = PolarGrid(np.array([0, 0, 0, 5, 5, 23, 23], np.int32), np.ones(7), KNOTS, N_SEGMENTS)
+    heights = np.concatenate([one, other, third])
+    labelled = Labelled(np.full(7, Label.GROUND, np.uint8), heights, heights)
+    found = correct_surface(surface, labelled, grid, noise, slope_std)
+    values = np.stack([found.correction, found.std, found.return_std], axis=-1)
+
+    e = heights[:5].mean()
+    between = (3.0 * (one.mean() - e) ** 2 + 2.0 * (other.mean() - e) ** 2) / 5.0
+    within = (3.0 * one.var() + 2.0 * other.var()) / 5.0
+    whole, k = between + within, 25.0 / 13.0
+    ground = (k * (between - within / 5.0) + PRIOR_CELLS * whole) / (k - 1.0 + PRIOR_CELLS)
+    ground += within / 5.0
+    both = e, np.sqrt(ground), np.sqrt(max(whole, ground))
+    np.testing.assert_allclose(values[:2, :2], np.full((2, 2, 3), both), atol=1e-6)
+    alone = third.mean(), own, np.hypot(own, noise)
+    np.testing.assert_allclose(values[4, 3:5], [alone, alone], atol=1e-6)
+    # Behind the third cell none is seen; the nearest knot that is lies 3 m away, 0.1 m lower.
+    apart = (slope_std * (KNOTS[5] - KNOTS[4])) ** 2
+    weight = own**2 / (2.0 * own**2 + apart)
+    variance = own**2 + apart + weight * (1.0 - weight) * 0.1**2
+    unseen = third.mean() - weight * 0.1, np.sqrt(variance), np.sqrt(variance + noise**2)
+    np.testing.assert_allclose(values[4, 5], unseen, atol=1e-6)
+    np.testing.assert_array_equal(np.isnan(found.mean), np.isnan(mean))
+    np.testing.assert_allclose(found.mean, mean + found.correction)
 
 
 @pytest.mark.parametrize('tilt', [None, (0.05, -0.1)])

@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data import semantic_kitti
-from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_labels, read_points
+from gp_ground_seg.data.semantic_kitti import Frame, list_frames, list_sequences, read_points
 
 FLOATS = st.floats(-1e4, 1e4, width=32) | st.sampled_from([np.nan, np.inf, -np.inf])
 
@@ -28,9 +28,10 @@ def test_points_come_back_bit_for_bit_and_labels_are_the_lower_half(
     assert (read.dtype, read.shape) == (np.float32, points.shape)
     assert read.tobytes() == points.tobytes()
     assert read.flags.writeable
+    entries = np.resize(entries, len(points))
     (folder / 'a.label').write_bytes(entries.tobytes())
-    labels = read_labels(folder / 'a.label', len(entries))
-    assert labels.tolist() == [int(entry) % 65536 for entry in entries]
+    frame = Frame('00', 'a', folder / 'a.bin', folder / 'a.label', 0.0)
+    assert frame.semantic.tolist() == [int(entry) % 65536 for entry in entries]
 
 
 def test_sequences_and_frames_are_sorted_and_need_scans(tmp_path):

@@ -20,7 +20,6 @@ from cli_runner import run
 from evaluation_samples import write_streets
 
 from gp_ground_seg import Config
-from gp_ground_seg.cli import tune
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data import files
 from gp_ground_seg.data.bags import BagReader, BagWriter
@@ -86,19 +85,6 @@ def content(folder):
     return found
 
 
-class Page:
-    """Writes the file of `tune` once, by its button."""
-
-    def __init__(self, _server, _inputs, config, *_begin):
-        self.config = config
-
-    def add_button(self, _title, write):
-        self.write = write
-
-    def run(self):
-        self.write(self.config)
-
-
 @pytest.fixture(scope='module')
 def inputs(tmp_path_factory):
     folder = tmp_path_factory.mktemp('inputs')
@@ -123,7 +109,6 @@ COMMANDS = {
     'KITTI': 'kitti-to-bag root --sequence 00 {}/out.mcap',
     'scores': 'evaluate root --cut 0 --json {}/out.json',
     'a picture': 'plot scan scans/0.bin -o {}/out.png',
-    'tuned': 'tune scans/0.bin -o {}/out.yaml',
 }
 
 
@@ -137,8 +122,6 @@ def words_of(line, folder, *more):
 @pytest.fixture
 def at_inputs(inputs, monkeypatch):
     monkeypatch.chdir(inputs)
-    monkeypatch.setattr(tune, 'open_server', lambda _port: contextlib.nullcontext((None, '')))
-    monkeypatch.setattr(tune, 'Tuner', Page)
     # The same text each time, which takes longer than all else.
     monkeypatch.setattr(Config, 'to_yaml', cache(Config.to_yaml))
 

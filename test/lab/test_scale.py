@@ -3,10 +3,7 @@
 import json
 import logging
 import os
-import re
 import signal
-import subprocess
-import sys
 import time
 from functools import partial
 
@@ -18,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import __version__
-from gp_ground_seg.core.errors import DataError, GroundSegError
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.lab import cluster
 
 dask, distributed = pytest.importorskip('dask'), pytest.importorskip('distributed')
@@ -174,12 +171,6 @@ def test_results_are_those_of_one_process_also_if_a_worker_dies(scheduler, tmp_p
             workers.run(_die, [7])
 
 
-def test_a_scheduler_with_keys_answers_nobody_without(locked_scheduler, monkeypatch):
-    monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT', 0.5)
-    with pytest.raises(GroundSegError, match='does not answer'):
-        cluster.open_runner(None, locked_scheduler[0], cluster._NO_BAR).__enter__()
-
-
 def test_workers_speak_tls_and_are_seen_on_this_machine_only():
     spawning = dask.config.set({'distributed.worker.multiprocessing-method': 'spawn'})
     with spawning, cluster.open_runner(1, None, cluster._NO_BAR) as runner:
@@ -240,29 +231,6 @@ def test_processes_that_are_stopped_leave_nothing_half_done(moment, victim, tmp_
     found = label_files(out)
     assert len(found) == n_scans and len({*found.values()}) == 1
     assert len([*(out / 'sequences/00/predictions').iterdir()]) == n_scans
-
-
-@pytest.mark.slow
-def test_a_scheduler_that_ends_meanwhile(root, tmp_path):
-    """As the machine that it runs on may."""
-    words = [sys.executable, '-m', 'distributed.cli.dask_scheduler', '--no-dashboard', '--host']
-    with subprocess.Popen(
-        [*words, 'tcp://127.0.0.1', '--port', '0'], stderr=subprocess.PIPE, text=True
-    ) as scheduler:
-        address = next(
-            found[0] for line in scheduler.stderr if (found := re.findall(r'tcp://[\d.:]+', line))
-        )
-        process = start('segment', root, '-o', tmp_path / 'out', '--scheduler', address)
-        for line in process.stderr:
-            if 'no worker yet' in line:
-                break
-        time.sleep(1.0)
-        scheduler.kill()
-        assert process.communicate(timeout=60) == (
-            '', 'gp-ground-seg: error: the scheduler is lost\n'
-        )  # fmt: skip
-        assert process.returncode == 2
-    assert not [*tmp_path.rglob('*.label')]
 
 
 def test_a_worker_of_another_version_is_refused():

@@ -280,11 +280,6 @@ def test_returns_of_a_vehicle_on_a_slope_lie_on_it(name):
     assert above.max() > 0.95 * max(z for _, corners in model.bodies for _, z in corners)
 
 
-def test_kinds_have_a_class_of_semantic_kitti():
-    found = semantic_kitti_labels(np.arange(len(Kind), dtype=np.uint8))
-    assert found.tolist() == [40, 10, 50, 80, 52, 1, 70, 30, 31]
-
-
 def test_numbers_and_heights_of_objects():
     """A vehicle of several solids is one object, of the height of its highest above the ground."""
     hill = slope(0.1)

@@ -29,8 +29,8 @@ from gp_ground_seg.core.frame import (
     Tiles,
 )
 from gp_ground_seg.core.gp.evidence import ODDS, uses_neighbours_in
-from gp_ground_seg.core.gp.latent import given_log_length_scales
-from gp_ground_seg.core.gp.learning import Learned, given_theta, theta_space
+from gp_ground_seg.core.gp.latent import given_log_length_scales, given_theta
+from gp_ground_seg.core.gp.learning import Learned, theta_space
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import numbers_of
@@ -114,6 +114,7 @@ class NumbaBackend:
         mean, std = np.empty((2, *shape))
         evidence.estimate_surface(
             frame,
+            given_theta(config),
             theta,
             numbers_of(config.observation),
             numbers_of(config.growth),
@@ -139,6 +140,8 @@ class NumbaBackend:
             knot_u,
             np.empty(n, np.bool_),
             np.empty(n, np.bool_),
+            np.empty(n),
+            np.empty(n),
             *np.empty((2, *shape)),
         )
 

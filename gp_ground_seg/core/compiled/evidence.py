@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.core.compiled.ground import SegmentSurfaces, grow_surfaces
+from gp_ground_seg.core.compiled.ground import SegmentSurfaces, grow_inliers, regress
 from gp_ground_seg.core.compiled.latent import latent_log_length_scales
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame
 from gp_ground_seg.core.gp.evidence import (
@@ -27,6 +27,7 @@ from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
 @jit(entry=True)
 def estimate_surface(
     frame: Frame,
+    given: FloatArray,
     theta: FloatArray,
     observation: ObservationConfig,
     growth: GrowthConfig,
@@ -39,28 +40,32 @@ def estimate_surface(
 ) -> None:
     """Do what `gp_ground_seg.core.gp.ground.estimate_surface` does, into the last three.
 
-    `is_latent` and `by_roughness` are the model of the length-scale and the rule of the labels by
-    the parameters, `uses_neighbours` is `uses_neighbours_in`.
+    `given` (T,) is `given_theta`, `is_latent` and `by_roughness` are the model of the length-scale
+    and the rule of the labels by the parameters, `uses_neighbours` is `uses_neighbours_in`.
     """
-    slope_std, knots, (n_segments, n_knots) = observation.slope_std, frame.knots, mean.shape
+    knots, (n_segments, n_knots) = frame.knots, mean.shape
     own, nothing = np.empty((2, n_segments, n_knots)), np.empty((2, 0, 0))
     table = np.empty((2, n_segments, n_knots))
+    u, knot_u = by_itself.log_length_scale, by_itself.knot_log_length_scale
     if is_latent:
-        u, knot_u = by_itself.log_length_scale, by_itself.knot_log_length_scale
-        latent_log_length_scales(frame, theta, 1, u, knot_u)
-    max_slope = CLEARLY * slope_std if uses_neighbours else -1.0
-    odds = _find_seeds(frame, theta, growth, max_slope, own[0], by_itself.seed)
+        latent_log_length_scales(frame, given, 1, u, knot_u)
+    max_slope = CLEARLY * observation.slope_std if uses_neighbours else -1.0
+    odds = _find_seeds(frame, given, growth, max_slope, own[0], by_itself.seed)
     odds = odds if by_roughness else 0.0
     from_neighbours = nothing
     if uses_neighbours:
         by_itself.mean[:], by_itself.std[:] = math.nan, math.nan
-        grow_surfaces(frame, theta, observation, growth, odds, nothing, STEP, by_itself)
-        _find_evidence(by_itself, theta, knots, slope_std, own, table)
+        grow_inliers(frame, given, observation, growth, odds, nothing, STEP, by_itself)
+        regress(frame, given, observation, STEP, by_itself)
+        _find_evidence(by_itself, given, knots, observation, own, table)
         from_neighbours = table
-    grow_surfaces(frame, theta, observation, growth, odds, from_neighbours, 1, by_itself)
+    grow_inliers(frame, given, observation, growth, odds, from_neighbours, 1, by_itself)
+    if is_latent:
+        latent_log_length_scales(frame, theta, 1, u, knot_u)
+    regress(frame, theta, observation, 1, by_itself)
     if uses_neighbours:
-        _find_evidence(by_itself, theta, knots, slope_std, own, table)
-    _combine(by_itself, from_neighbours, theta, knots, slope_std, frame.prior_mean, mean, std)
+        _find_evidence(by_itself, theta, knots, observation, own, table)
+    _combine(by_itself, from_neighbours, theta, knots, observation, frame.prior_mean, mean, std)
 
 
 @jit()
@@ -145,7 +150,7 @@ def _find_evidence(
     by_itself: SegmentSurfaces,
     theta: FloatArray,
     knots: FloatArray,
-    slope_std: float,
+    observation: ObservationConfig,
     own_evidence: FloatArray,
     from_neighbours: FloatArray,
 ) -> None:
@@ -160,13 +165,13 @@ def _find_evidence(
     start, end = np.uintp(0), np.uintp(n_knots)
     nearest, nearest_std, rise = np.empty(n_knots), np.empty(n_knots), np.empty(n_knots)
     for j in range(start, end):
-        rise[j] = slope_std * 2.0 * math.pi / n_segments * knots[j]
+        rise[j] = observation.slope_std * 2.0 * math.pi / n_segments * knots[j]
     sill = math.exp(theta[0]) ** 2
     for m in range(n_segments):
         mean_m, std_m = by_itself.mean[m], by_itself.std[m]
         height, deviation = own_evidence[0, m], own_evidence[1, m]
         for j in range(start, end):
-            prior = prior_variance(sill, slope_std, knots[j])
+            prior = prior_variance(sill, observation, knots[j])
             height[j], deviation[j] = shown_by(mean_m[j], std_m[j], prior)
     from_neighbours[:] = 0.0
     for side in range(2):
@@ -199,7 +204,7 @@ def _combine(
     from_neighbours: FloatArray,
     theta: FloatArray,
     knots: FloatArray,
-    slope_std: float,
+    observation: ObservationConfig,
     prior_mean: float,
     mean: FloatArray,
     std: FloatArray,
@@ -218,7 +223,7 @@ def _combine(
                 mean[m, j], std[m, j] = combined_surface(
                     mean[m, j],
                     std[m, j],
-                    prior_variance(sill, slope_std, knots[j]),
+                    prior_variance(sill, observation, knots[j]),
                     from_neighbours[0, m, j],
                     from_neighbours[1, m, j],
                 )

@@ -1,13 +1,9 @@
 """Compiled twin of `gp_ground_seg.core.gp.ground`.
 
-Row k of `whitened` is that of ``L^-1 K(inliers, candidates and knots)``. Adding an
-inlier appends one row, after which means and variances everywhere follow by one
-multiplication: a whole segment costs one factorisation. Inliers join from near to far,
-mostly: columns nearer than the first candidate that is no inlier need no more rows.
-
-The slope of the mean line is an unknown of its own (Rasmussen and Williams 2006, section 2.7), not
-a part of the covariance, so that single precision is enough for that: ``slope_std^2 r r'`` would
-be a thousand times the rest far away.
+Row k of `whitened` is that of ``L^-1 K(inliers, columns)``. Adding an inlier appends one row,
+after which means and variances everywhere follow by one multiplication: a whole segment costs one
+factorisation. Inliers join from near to far, mostly: columns nearer than the first candidate that
+is no inlier need no more rows.
 """
 
 from __future__ import annotations
@@ -20,13 +16,26 @@ import numpy as np
 from gp_ground_seg.core.compiled.numerics import LANES
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, IntArray
 from gp_ground_seg.core.gp.evidence import between_knots, combined, contradicts
-from gp_ground_seg.core.gp.ground import fits, noise_among, noise_in_doubt, variances_of
-from gp_ground_seg.core.gp.kernels import paciorek
+from gp_ground_seg.core.gp.ground import (
+    fits,
+    goes_on,
+    noise_among,
+    noise_in_doubt,
+    variances_of,
+)
+from gp_ground_seg.core.gp.kernels import (
+    line_covariance,
+    line_variances,
+    paciorek,
+    prior_variance,
+)
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
+from gp_ground_seg.core.pipeline.lines import is_walkable
 
-ROUNDING = 1e-6
-"""Least noise of what is observed, in parts of sigma_f^2: the rounding of single precision."""
+ROUNDING = 1e-7
+"""Least noise of what is observed, in parts of the largest prior variance: the rounding of single
+precision."""
 
 
 class SegmentSurfaces(NamedTuple):
@@ -37,6 +46,8 @@ class SegmentSurfaces(NamedTuple):
     knot_log_length_scale: FloatArray
     seed: BoolArray  # (C,) candidates that start the inlier set
     inlier: BoolArray  # (C,) candidates that the surface rests on
+    alike: FloatArray  # (C,) candidates close to each, itself as well, see `noise_among`
+    doubt: FloatArray  # (C,) variance by which an inlier may be an obstacle [m^2]
     # (M, K) height about the prior mean and its standard deviation at the knots [m]; NaN where
     # there is none
     mean: FloatArray
@@ -44,16 +55,12 @@ class SegmentSurfaces(NamedTuple):
 
 
 class _Columns(NamedTuple):
-    """State of the n candidates of a segment, and of the knots behind them; one column each."""
+    """State of the candidates of a segment, or of its inliers and the knots; one column each."""
 
     r: FloatArray  # (size,) float32, ranges [m]
     length_scale: FloatArray  # (size,) float32 [m]
-    # (size,) float32, prediction about the prior mean [m], and its variance [m^2], if the slope
-    # is 0
-    height: FloatArray
-    variance: FloatArray
-    lever: FloatArray  # (size,) float32, how much the prediction changes with the slope [m]
-    slope: FloatArray  # (2,) what the inliers show of the slope: precision, and that times slope
+    height: FloatArray  # (size,) float32, prediction about the prior mean [m]
+    variance: FloatArray  # (size,) float32, its variance [m^2]
     z: FloatArray  # (n,) heights of the candidates about the prior mean [m]
     noise: FloatArray  # (n,) variances of the noise with which they are observed [m^2]
     neighbour_height: FloatArray  # (n,) evidence at the candidates [m]
@@ -63,8 +70,52 @@ class _Columns(NamedTuple):
     whitened: FloatArray  # (n, size) float32, one row for each inlier
 
 
+class _Prior(NamedTuple):
+    """Prior of the heights of all segments."""
+
+    sill: float  # variance of the process [m^2]
+    slope: float  # variance of the slope of the mean line
+    sixth: float  # a sixth of the variance that it gains over a metre [1/m]
+    noise: float  # variance of the noise of a candidate by itself [m^2]
+
+
+@jit(part=True)
+def _prior_of(frame: Frame, theta: FloatArray, observation: ObservationConfig) -> _Prior:
+    sill, noise = variances_of(theta)
+    slope, sixth = line_variances(observation)
+    farthest = 0.0
+    for c in range(len(frame.candidates.r)):
+        farthest = max(farthest, frame.candidates.r[c])
+    noise = max(noise, ROUNDING * prior_variance(sill, observation, farthest))
+    return _Prior(sill, slope, sixth, noise)
+
+
+@jit(part=True)
+def _make_columns(frame: Frame, step: int, n_knots: int) -> _Columns:
+    """Room for any of every `step`-th segment, with `n_knots`."""
+    offsets, most = frame.candidates.offsets, 0
+    for m in range(0, len(offsets) - 1, step):
+        most = max(most, offsets[m + 1] - offsets[m])
+    width = (most + n_knots + LANES - 1) & -LANES
+    single, table = np.empty((4, width), np.float32), np.empty((4, most))
+    # One by one, so that the compiler knows them to be contiguous.
+    return _Columns(
+        single[0],
+        single[1],
+        single[2],
+        single[3],
+        table[0],
+        table[1],
+        table[2],
+        table[3],
+        np.zeros(most, np.bool_),
+        np.empty(most, np.int64),
+        np.empty((most, width), np.float32),
+    )
+
+
 @jit()
-def grow_surfaces(
+def grow_inliers(
     frame: Frame,
     theta: FloatArray,
     observation: ObservationConfig,
@@ -74,70 +125,78 @@ def grow_surfaces(
     step: int,
     by_itself: SegmentSurfaces,
 ) -> None:
-    """Inliers and surface of every `step`-th segment, into `by_itself`.
+    """Inliers of every `step`-th segment, into `by_itself`, which has the seeds.
 
     `from_neighbours` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is
-    none.
-    Unless `odds` are 0, a candidate among others, or that joins in doubt, shows less: see
+    none. Unless `odds` are 0, a candidate among others, or that joins in doubt, shows less: see
     `noise_among` and `noise_in_doubt`.
     """
-    offsets, mean, std = frame.candidates.offsets, by_itself.mean, by_itself.std
-    most = 0
-    for m in range(0, len(mean), step):
-        most = max(most, offsets[m + 1] - offsets[m])
-    width = (most + len(frame.knots) + LANES - 1) & -LANES
-    single, table = np.empty((5, width), np.float32), np.empty((4, most))
-    # One by one, so that the compiler knows them to be contiguous.
-    columns = _Columns(
-        single[0],
-        single[1],
-        single[2],
-        single[3],
-        single[4],
-        np.empty(2),
-        table[0],
-        table[1],
-        table[2],
-        table[3],
-        np.zeros(most, np.bool_),
-        np.empty(most, np.int64),
-        np.empty((most, width), np.float32),
-    )
-    slope = observation.slope_std**2
-    sill, noise = variances_of(theta)
-    noise = max(noise, ROUNDING * sill)
+    columns, prior = _make_columns(frame, step, 0), _prior_of(frame, theta, observation)
     reach = math.exp(theta[3]) if odds > 0.0 else 0.0
-    for m in range(0, len(mean), step):
-        for j in range(len(frame.knots)):
-            mean[m, j] = std[m, j] = np.nan
+    for m in range(0, len(frame.candidates.offsets) - 1, step):
         n, n_new, has_neighbours = _begin(
-            frame, m, noise, reach, from_neighbours, by_itself, columns
+            frame, m, prior.noise, reach, from_neighbours, by_itself, columns
         )
-        if n_new == 0 and not has_neighbours:
-            continue
-        n_knots = 0
-        knot_u = by_itself.knot_log_length_scale[m]
-        while n_knots < len(knot_u) and not math.isnan(knot_u[n_knots]):
-            n_knots += 1
-        size = (n + n_knots + LANES - 1) & -LANES
-        _lay_out(frame, m, n_knots, size, sill, by_itself, columns)
-        n_inliers = _grow(
-            frame, m, size, n_new, sill, slope, noise, growth, odds, by_itself, columns
-        )
-        if n_inliers == 0:
-            continue
-        for j in range(n_knots):
-            mean[m, j], variance = _predict(n + j, slope, columns)
-            std[m, j] = math.sqrt(max(variance, 0.0))
+        if n_new > 0 or has_neighbours:
+            _grow(frame, m, n_new, prior, growth, odds, by_itself, columns)
+        first = frame.candidates.offsets[m]
+        for i in range(n):
+            certain = noise_among(by_itself.alike[first + i], prior.noise)
+            by_itself.doubt[first + i] = columns.noise[i] - certain
 
 
 @jit()
-def _predict(j: int, slope: float, columns: _Columns) -> tuple[float, float]:
-    """Height and variance at column `j`; `slope` is the prior variance of the slope."""
-    variance = slope / (1.0 + slope * columns.slope[0])
-    lever = np.float64(columns.lever[j])
-    height = columns.height[j] + lever * variance * columns.slope[1]
-    return height, columns.variance[j] + lever * lever * variance
+def regress(
+    frame: Frame,
+    theta: FloatArray,
+    observation: ObservationConfig,
+    step: int,
+    by_itself: SegmentSurfaces,
+) -> None:
+    """Surface of every `step`-th segment by its inliers and `theta`, into `by_itself`."""
+    knots, candidates = frame.knots, frame.candidates
+    columns = _make_columns(frame, step, len(knots))
+    prior = _prior_of(frame, theta, observation)
+    r, length_scale = columns.r, columns.length_scale
+    for m in range(0, len(by_itself.mean), step):
+        mean, std, knot_u = by_itself.mean[m], by_itself.std[m], by_itself.knot_log_length_scale[m]
+        for j in range(len(knots)):
+            mean[j] = std[j] = np.nan
+        n = n_knots = 0
+        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            if by_itself.inlier[c]:
+                r[n], length_scale[n] = candidates.r[c], by_itself.log_length_scale[c]
+                columns.z[n] = candidates.z[c] - frame.prior_mean
+                columns.noise[n] = noise_among(by_itself.alike[c], prior.noise)
+                columns.noise[n] += by_itself.doubt[c]
+                n += 1
+        if n == 0:
+            continue
+        while n_knots < len(knots) and not math.isnan(knot_u[n_knots]):
+            r[n + n_knots], length_scale[n + n_knots] = knots[n_knots], knot_u[n_knots]
+            n_knots += 1
+        size = _lay_out(n + n_knots, prior, columns)
+        for i in range(n):
+            _observe(i, i, i & -LANES, size, prior, columns)
+        for j in range(n_knots):
+            mean[j] = columns.height[n + j]
+            std[j] = math.sqrt(max(columns.variance[n + j], 0.0))
+
+
+@jit(part=True)
+def _lay_out(n: int, prior: _Prior, columns: _Columns) -> int:
+    """Set the prior of `n` columns; return their number in whole vectors.
+
+    Their log length-scales become length-scales.
+    """
+    size, r, length_scale = (n + LANES - 1) & -LANES, columns.r, columns.length_scale
+    for j in range(n, size):
+        r[j] = length_scale[j] = 0.0
+    for j in range(size):
+        length_scale[j] = math.exp(length_scale[j])
+        columns.height[j] = 0.0
+        columns.variance[j] = prior.sill + line_covariance(r[j], r[j], prior.slope, prior.sixth)
+    return size
 
 
 @jit(part=True)
@@ -165,6 +224,7 @@ def _begin(
             near += 1
         while far < stop and candidates.r[far] - r <= reach:
             far += 1
+        by_itself.alike[c] = far - near
         columns.z[i], columns.noise[i] = z, noise_among(far - near, noise)
         height = precision = 0.0
         if from_neighbours.shape[1] > 0:
@@ -183,62 +243,30 @@ def _begin(
 
 
 @jit(part=True)
-def _lay_out(
-    frame: Frame,
-    m: int,
-    n_knots: int,
-    size: int,
-    sill: float,
-    by_itself: SegmentSurfaces,
-    columns: _Columns,
-) -> None:
-    """Set ranges and length-scales of candidates and knots, and their prior."""
-    first = frame.candidates.offsets[m]
-    n = frame.candidates.offsets[m + 1] - first
-    r, length_scale, variance = columns.r, columns.length_scale, columns.variance
-    # Element by element: assigned slices take as long, and seconds to compile.
-    for i in range(n):
-        r[i] = frame.candidates.r[first + i]
-        length_scale[i] = by_itself.log_length_scale[first + i]
-    for j in range(n_knots):
-        r[n + j], length_scale[n + j] = frame.knots[j], by_itself.knot_log_length_scale[m, j]
-    for j in range(n + n_knots, size):
-        r[j] = length_scale[j] = 0.0
-    for j in range(size):
-        length_scale[j] = math.exp(length_scale[j])
-        columns.height[j], variance[j], columns.lever[j] = 0.0, sill, r[j]
-    columns.slope[:] = 0.0
-
-
-@jit(part=True)
 def _grow(
     frame: Frame,
     m: int,
-    size: int,
     n_new: int,
-    sill: float,
-    slope: float,
-    noise: float,
+    prior: _Prior,
     growth: GrowthConfig,
     odds: float,
     by_itself: SegmentSurfaces,
     columns: _Columns,
-) -> int:
-    """Let the new ones join, and those that then fit, until none does; return the number."""
+) -> None:
+    """Let the new ones join, and those that then fit, until none does."""
     first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
     inlier, in_face = by_itself.inlier[first:stop], frame.in_face[first:stop]
-    continues_line = frame.continues_line[first:stop]
+    onward, r, z = frame.onward[first:stop], frame.candidates.r[first:stop], columns.z
+    for i in range(stop - first):
+        columns.r[i], columns.length_scale[i] = r[i], by_itself.log_length_scale[first + i]
+    size = _lay_out(stop - first, prior, columns)
     n_inliers = done = 0
     for a in range(n_new):
         i = columns.new[a]
         if odds > 0.0 and in_face[i]:
-            height, variance = combined(
-                *_predict(i, slope, columns),
-                columns.neighbour_height[i],
-                columns.neighbour_precision[i],
-            )
+            height, variance = _predict(i, columns)
             columns.noise[i] = noise_in_doubt(
-                columns.z[i], height, variance, columns.noise[i], True, odds
+                z[i], height, variance, columns.noise[i], True, odds
             )
     while n_new > 0 or n_inliers == 0:
         for a in range(n_new):
@@ -247,49 +275,59 @@ def _grow(
             while done < len(inlier) and inlier[done]:
                 done += 1
             # The columns before are not needed any more.
-            _observe(i, n_inliers, min(i, done) & -LANES, size, sill, columns)
+            _observe(i, n_inliers, min(i, done) & -LANES, size, prior, columns)
             n_inliers += 1
-        n_new = 0
+        n_new, last = 0, done - 1
         for i in range(done, len(inlier)):
-            precision = columns.neighbour_precision[i]
             # Before anything has joined, only the evidence of neighbours decides.
-            if inlier[i] or (n_inliers == 0 and precision == 0.0):
+            if inlier[i]:
+                last = i
                 continue
-            follows = i > 0 and inlier[i - 1] and continues_line[i] and not columns.above[i]
-            if not follows:
-                height, variance = combined(
-                    *_predict(i, slope, columns), columns.neighbour_height[i], precision
+            if n_inliers == 0 and columns.neighbour_precision[i] == 0.0:
+                continue
+            height, variance = _predict(i, columns)
+            follows = fits(z[i], height, variance, prior.noise, growth)
+            if follows and odds > 0.0:
+                columns.noise[i] = noise_in_doubt(
+                    z[i], height, variance, columns.noise[i], in_face[i], odds
                 )
-                follows = fits(columns.z[i], height, variance, noise, growth)
-                if follows and odds > 0.0:
-                    columns.noise[i] = noise_in_doubt(
-                        columns.z[i], height, variance, columns.noise[i], in_face[i], odds
-                    )
+            if not follows and last >= 0:
+                rise, distance = z[i] - z[last], r[i] - r[last]
+                walkable = is_walkable(rise, distance, growth.max_slope)
+                if walkable and not in_face[i] and not columns.above[i]:
+                    follows = goes_on(rise, distance, onward[i])
+                else:
+                    last = -1  # it stands on the ground, which does not go on behind it
             if follows:
                 columns.new[n_new] = i
                 n_new += 1
         if n_new == 0:
             break
-    return n_inliers
+
+
+@jit(part=True)
+def _predict(i: int, columns: _Columns) -> tuple[float, float]:
+    """Height and variance at candidate i, with the evidence of neighbours."""
+    height, variance = np.float64(columns.height[i]), np.float64(columns.variance[i])
+    return combined(
+        height, variance, columns.neighbour_height[i], columns.neighbour_precision[i]
+    )
 
 
 @jit(part=True)
 def _observe(
-    i: int,
-    n_inliers: int,
-    near: int,
-    size: int,
-    sill: float,
-    columns: _Columns,
+    i: int, n_inliers: int, near: int, size: int, prior: _Prior, columns: _Columns
 ) -> None:
     """Condition the columns from `near` on on candidate i: one more row of `whitened`."""
     r, length_scale, whitened = columns.r, columns.length_scale, columns.whitened
-    row, r_i, l_i, single_sill = whitened[n_inliers], r[i], length_scale[i], np.float32(sill)
+    row, r_i, l_i, sill = whitened[n_inliers], r[i], length_scale[i], np.float32(prior.sill)
+    slope, sixth = np.float32(prior.slope), np.float32(prior.sixth)
     # Unsigned, as a signed index could count from the end.
     start, end = np.uintp(near), np.uintp(size)
     # Prior covariance of column i with the others (paper, eq. 8).
     for j in range(start, end):
-        row[j] = paciorek(r_i, l_i, r[j], length_scale[j], single_sill)
+        row[j] = paciorek(r_i, l_i, r[j], length_scale[j], sill)
+        row[j] += line_covariance(r_i, r[j], slope, sixth)
     # Subtract the projection on the rows before, four rows at a time, so that the
     # new row is read and written once for all of them.
     k = 0
@@ -305,16 +343,12 @@ def _observe(
         for j in range(start, end):
             row[j] -= w_0 * row_0[j]
         k += 1
-    height, variance, lever = columns.height, columns.variance, columns.lever
+    height, variance = columns.height, columns.variance
     precision = 1.0 / (max(variance[i], 0.0) + columns.noise[i])
-    missed, lever_i = columns.z[i] - height[i], np.float64(lever[i])
-    columns.slope[0] += lever_i * lever_i * precision
-    columns.slope[1] += lever_i * missed * precision
     scale = np.float32(math.sqrt(precision))
-    innovation, turn = np.float32(missed) * scale, np.float32(lever_i) * scale
+    innovation = np.float32(columns.z[i] - height[i]) * scale
     for j in range(start, end):
         value = row[j] * scale
         row[j] = value
         height[j] += value * innovation
-        lever[j] -= value * turn
         variance[j] -= value * value

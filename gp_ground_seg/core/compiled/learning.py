@@ -1,4 +1,4 @@
-"""Compiled twin of `gp_ground_seg.core.gp.learning`: all rounds of a frame in one call."""
+"""Compiled twin of `gp_ground_seg.core.gp.learning`: a frame in one call."""
 
 from __future__ import annotations
 
@@ -6,17 +6,14 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.core.compiled.ground import SegmentSurfaces, grow_surfaces
+from gp_ground_seg.core.compiled.ground import SegmentSurfaces, grow_inliers
 from gp_ground_seg.core.compiled.latent import latent_log_length_scales
 from gp_ground_seg.core.compiled.likelihood import log_likelihood
 from gp_ground_seg.core.frame import FloatArray, Frame, Inliers
 from gp_ground_seg.core.gp.evidence import is_low_and_near
 from gp_ground_seg.core.gp.learning import (
-    BUDGET,
-    FARTHEST_START,
     ThetaSpace,
     maximise,
-    missed_by_line,
     set_likelihood,
 )
 from gp_ground_seg.core.jit import compiled_form, jit
@@ -27,11 +24,11 @@ from gp_ground_seg.core.parameters.config import GrowthConfig, LearningConfig, O
 def _set_likelihood(
     theta: FloatArray,
     inliers: Inliers,
-    slope_std: float,
+    observation: ObservationConfig,
     latent_terms: bool,
     gradient: FloatArray,
 ) -> float:
-    return log_likelihood(theta, inliers, slope_std, latent_terms, gradient)
+    return log_likelihood(theta, inliers, observation, latent_terms, gradient)
 
 
 @jit(entry=True)
@@ -51,55 +48,21 @@ def learn_frame(
     """Do what the twin does, into `theta` (T,), which holds the given values.
 
     The frame has no knots. `is_map` and `is_latent` are the objective and the model of the
-    length-scale, `odds` as of `grow_surfaces`; `by_itself` has no knots, and the log length-scales
+    length-scale, `odds` as of `grow_inliers`; `by_itself` has no knots, and the log length-scales
     at the candidates if these are given. Sets `outcome` (2,) to the objective and the place of the
     status in `STATUSES`, and returns the number of evaluations.
     """
-    _set_first_theta(frame, growth, theta)
     step, nothing, has_latent = learning.segment_step, np.empty((2, 0, 0)), False
     for i in range(2, len(theta)):
         has_latent |= space.free[i]
-    outcome[0], outcome[1] = -math.inf, BUDGET
-    n_rounds = n_before = n_evaluations = 0
-    budget = max(learning.max_evaluations // 2, 1)
-    while budget > 0:
-        if is_latent:
-            at_knots = by_itself.knot_log_length_scale
-            latent_log_length_scales(frame, theta, step, by_itself.log_length_scale, at_knots)
-        _set_seeds(frame, growth, step, by_itself)
-        grow_surfaces(frame, theta, observation, growth, odds, nothing, step, by_itself)
-        inliers = _take_inliers(frame, step, has_latent, by_itself)
-        n_rounds += 1
-        if n_rounds > 2 and len(inliers.r) <= n_before:
-            break
-        n_before = len(inliers.r)
-        slope_std = observation.slope_std
-        n_evaluations += maximise(space, inliers, slope_std, is_map, budget, theta, outcome)
-        budget = learning.max_evaluations - n_evaluations
-    return n_evaluations
-
-
-@jit(part=True)
-def _set_first_theta(frame: Frame, growth: GrowthConfig, theta: FloatArray) -> None:
-    """See the plain `first_theta`."""
-    candidates, lines = frame.candidates, frame.lines
-    r, z, line, most = candidates.r, candidates.z, lines.line, growth.seed_height_tolerance
-    numbers, squares = np.zeros(2), np.zeros(2)
-    for c in range(len(r)):
-        q = line[c]
-        is_ground = abs(lines.slope[q]) <= growth.max_line_slope
-        is_ground &= lines.start[q + 1] - lines.start[q] >= growth.min_line_size
-        if is_ground and r[c] <= growth.seed_range:
-            numbers[0] += 1.0
-            squares[0] += min(abs(z[c] - frame.prior_mean), most) ** 2
-        if 0 < c < len(r) - 1 and line[c - 1] == line[c + 1]:
-            before, behind = (r[c - 1], z[c - 1]), (r[c + 1], z[c + 1])
-            numbers[1] += 1.0
-            squares[1] += min(abs(missed_by_line(before, (r[c], z[c]), behind)), most) ** 2
-    for i in range(2):
-        if squares[i] > 0.0:
-            shown = 0.5 * math.log(squares[i] / numbers[i])
-            theta[i] = min(max(shown, theta[i] - FARTHEST_START), theta[i] + FARTHEST_START)
+    if is_latent:
+        at_knots = by_itself.knot_log_length_scale
+        latent_log_length_scales(frame, theta, step, by_itself.log_length_scale, at_knots)
+    _set_seeds(frame, growth, step, by_itself)
+    grow_inliers(frame, theta, observation, growth, odds, nothing, step, by_itself)
+    inliers = _take_inliers(frame, step, has_latent, by_itself)
+    most = learning.max_evaluations
+    return maximise(space, inliers, observation, is_map, most, theta, outcome)
 
 
 @jit(part=True)

@@ -7,11 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.compiled.numerics import factorise, invert, invert_triangle
+from gp_ground_seg.core.compiled.numerics import factorise, invert
 from gp_ground_seg.core.frame import FloatArray, Inliers, IntArray
-from gp_ground_seg.core.gp.kernels import paciorek, squared_exponential
+from gp_ground_seg.core.gp.kernels import (
+    line_covariance,
+    line_variances,
+    paciorek,
+    squared_exponential,
+)
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.core.jit import jit
+from gp_ground_seg.core.parameters.config import ObservationConfig
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
@@ -31,7 +37,7 @@ class _Latent(NamedTuple):
 def log_likelihood(
     theta: FloatArray,
     inliers: Inliers,
-    slope_std: float,
+    observation: ObservationConfig,
     latent_terms: bool,
     gradient: FloatArray,
 ) -> float:
@@ -40,7 +46,7 @@ def log_likelihood(
     for i in range(len(theta)):
         gradient[i] = 0.0
     for m in range(len(inliers.offsets) - 1):
-        value += _of_segment(theta, inliers, m, slope_std, latent_terms, own)
+        value += _of_segment(theta, inliers, m, observation, latent_terms, own)
         if not math.isfinite(value):
             for i in range(len(theta)):
                 gradient[i] = 0.0
@@ -55,7 +61,7 @@ def _of_segment(
     theta: FloatArray,
     inliers: Inliers,
     m: int,
-    slope_std: float,
+    observation: ObservationConfig,
     latent_terms: bool,
     gradient: FloatArray,
 ) -> float:
@@ -84,14 +90,13 @@ def _of_segment(
     if p > 0 and not _predict_log_length_scales(theta, l_bar, r, latent, u):
         return -math.inf
     k, factor, whitened = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    if not _factorise_covariance(theta, slope_std, r, u, k, factor):
+    if not _factorise_covariance(theta, observation, r, u, k, factor):
         return -math.inf
-    if p == 0:
-        value: float = _of_given_length_scales(theta, slope_std, r, z, factor, whitened, gradient)
-        return value
     g_u, inverse = np.zeros(n), np.empty((n, n))
     invert(factor, n, whitened, inverse)
-    value = _of_observations(theta, r, z, u, k, factor, inverse, gradient, g_u)
+    value: float = _of_observations(theta, r, z, u, k, factor, inverse, gradient, g_u)
+    if p == 0:
+        return value
     return value + _of_latent_process(theta, latent_terms, r, kind, latent, g_u, gradient)
 
 
@@ -130,7 +135,7 @@ def _predict_log_length_scales(
 @jit(part=True)
 def _factorise_covariance(
     theta: FloatArray,
-    slope_std: float,
+    observation: ObservationConfig,
     r: FloatArray,
     u: FloatArray,
     k: FloatArray,
@@ -141,53 +146,15 @@ def _factorise_covariance(
     length_scale = np.empty(len(r))
     for i in range(n):
         length_scale[i] = math.exp(u[i])
+    slope, sixth = line_variances(observation)
     for i in range(n):
-        r_i, l_i, tilt = r[i], length_scale[i], slope_std**2 * r[i]
+        r_i, l_i = r[i], length_scale[i]
         for j in range(i, n):
             value = paciorek(r_i, l_i, r[j], length_scale[j], variance)
             k[i, j] = value
-            factor[i, j] = value + tilt * r[j]
+            factor[i, j] = value + line_covariance(r_i, r[j], slope, sixth)
         factor[i, i] += noise
     return factorise(factor, len(r))
-
-
-@jit(part=True)
-def _of_given_length_scales(
-    theta: FloatArray,
-    slope_std: float,
-    r: FloatArray,
-    z: FloatArray,
-    factor: FloatArray,
-    whitened: FloatArray,
-    gradient: FloatArray,
-) -> float:
-    """Return the value without a latent process; set the gradient.
-
-    Both derivatives follow from traces: K is A without noise and slope.
-    """
-    n, noise, slope = len(r), math.exp(theta[1]) ** 2, slope_std**2
-    invert_triangle(factor, n, whitened)
-    alpha = np.zeros(n)
-    value = -0.5 * n * _LOG_2PI
-    trace = square_sum = tilt_trace = tilt_sum = fit = 0.0
-    for i in range(n):
-        row = whitened[i]
-        sum_z = sum_r = 0.0
-        for j in range(i + 1):
-            sum_z += row[j] * z[j]
-            sum_r += row[j] * r[j]
-            trace += row[j] * row[j]
-        for j in range(i + 1):
-            alpha[j] += row[j] * sum_z
-        tilt_trace += sum_r * sum_r
-        fit += sum_z * sum_z
-        value -= math.log(factor[i, i])
-    for i in range(n):
-        square_sum += alpha[i] * alpha[i]
-        tilt_sum += alpha[i] * r[i]
-    gradient[1] = noise * (square_sum - trace)
-    gradient[0] = fit - slope * tilt_sum * tilt_sum - n + slope * tilt_trace - gradient[1]
-    return value - 0.5 * fit
 
 
 @jit(part=True)

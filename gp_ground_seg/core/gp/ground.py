@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,13 +31,16 @@ from gp_ground_seg.core.gp.kernels import (
     add_noise,
     batches,
     inverse_of_lower,
+    line_covariance,
+    line_variances,
     paciorek,
     prior_variance,
     single_threaded_blas,
 )
-from gp_ground_seg.core.gp.latent import given_log_length_scales, latent_log_length_scales
+from gp_ground_seg.core.gp.latent import given_theta, log_length_scales
 from gp_ground_seg.core.jit import choose, shared
-from gp_ground_seg.core.parameters.config import Config, GrowthConfig
+from gp_ground_seg.core.parameters.config import Config, GrowthConfig, ObservationConfig
+from gp_ground_seg.core.pipeline.lines import is_walkable
 
 
 @single_threaded_blas()
@@ -46,19 +49,14 @@ def estimate_surface(
 ) -> tuple[GroundSurface, FloatArray, FloatArray]:
     """Inliers that grow from low, near candidates, and the surface that rests on them.
 
-    A candidate joins when the predictive standard deviation is at most
-    ``growth.max_std`` and its standardised residual is at most
-    ``growth.max_standardised_residual`` above the prediction, or
-    ``growth.max_standardised_depth`` below; or when it continues the line of an inlier.
-    This repeats until none joins (GP-INSAC of Chen et al. 2014; the paper's outlier
-    rejection). The gate is asymmetric because obstacles stand only above the ground. The
-    height and variance of the surface are the paper's eqs. 6 and 7.
+    The inliers grow under the values of theta that the configuration gives (see `grow_inliers`).
+    The surface is the regression on them under `theta`: what is learned from inliers does not
+    choose them. Its height and variance are the paper's eqs. 6 and 7.
 
     With ``surface.look_aside`` one of `STEP` segments grows by itself first. Then all grow: the
     prediction is that of the segment and of those beside it together, and what stands above the
-    latter alone neither starts the set nor joins it by a line (see
-    `gp_ground_seg.core.gp.evidence`).
-    The surface, too, is that of the segment and of those beside it together.
+    latter alone does not start the set (see `gp_ground_seg.core.gp.evidence`). The surface, too,
+    is that of the segment and of those beside it together.
 
     Parameters
     ----------
@@ -67,7 +65,7 @@ def estimate_surface(
     theta : (T,) float64
         Hyper-parameters of the frame (see `gp_ground_seg.core.gp.learning`).
     config : Config
-        Model of the length-scale, prior slope, gates.
+        Model of the length-scale, prior of the line, gates.
 
     Returns
     -------
@@ -78,47 +76,29 @@ def estimate_surface(
     log_length_scale : (C,) float64
         At the candidates [log m].
     """
-    candidates, knots, slope_std = frame.candidates, frame.knots, config.observation.slope_std
-    u, knot_u = log_length_scales(frame, theta, config)
-    z = candidates.z - frame.prior_mean
-    sill, gate_noise = variances_of(theta)
-    largest = prior_variance(sill, slope_std, candidates.r.max(initial=0.0))
-    gate_noise = max(gate_noise, ROUNDING * largest)
-    noise = np.full(len(z), gate_noise)
-    by_itself = SegmentSurfaces.empty(len(z), knot_u.shape)
-    seed, odds = seeds(frame, theta, config)
-    if config.label.rule == 'roughness':
-        n_near = _count_near(candidates, np.exp(theta[3]))
-        noise = noise_among(n_near, noise)
-    else:
-        odds = 0.0
-    model = _Model(frame, sill, gate_noise, z, noise, np.exp(u), np.exp(knot_u), seed, odds)
+    candidates, knots, given = frame.candidates, frame.knots, given_theta(config)
     everywhere = np.arange(candidates.n_segments)
     uses_neighbours = uses_neighbours_in(frame, config)
-    from_neighbours = Evidence(*np.zeros((2, len(z))))
-    prior = prior_variance(sill, slope_std, knots)
+    from_neighbours = Evidence(*np.zeros((2, len(candidates.r))))
+    seed, odds = seeds(frame, given, config)
 
-    def evidence() -> Evidence:
-        return evidence_of_neighbours(by_itself.mean, by_itself.std, prior, knots, slope_std)
+    def evidence(mean: FloatArray, std: FloatArray, theta: FloatArray) -> tuple[Any, ...]:
+        prior = prior_variance(variances_of(theta)[0], config.observation, knots)
+        slope_std = config.observation.slope_std
+        return prior, evidence_of_neighbours(mean, std, prior, knots, slope_std)
 
     if uses_neighbours:
-        _grow_segments(everywhere[::STEP], model, from_neighbours, config, by_itself)
-        from_neighbours = at_candidates(evidence(), candidates, knots)
-    _grow_segments(everywhere, model, from_neighbours, config, by_itself)
-    mean, std = by_itself.mean, by_itself.std
+        few = everywhere[::STEP]
+        inliers = grow_inliers(frame, few, seed, odds, from_neighbours, config)
+        _, shown = evidence(*_regress(frame, few, inliers, given, config)[:2], given)
+        from_neighbours = at_candidates(shown, candidates, knots)
+    inliers = grow_inliers(frame, everywhere, seed, odds, from_neighbours, config)
+    mean, std, knot_u, u = _regress(frame, everywhere, inliers, theta, config)
     if uses_neighbours:
-        mean, std = combined_surface(mean, std, prior, *evidence())
+        prior, shown = evidence(mean, std, theta)
+        mean, std = combined_surface(mean, std, prior, *shown)
         mean[np.isnan(knot_u)] = std[np.isnan(knot_u)] = np.nan
-    return GroundSurface(knots, mean + frame.prior_mean, std, by_itself.inlier), knot_u, u
-
-
-def log_length_scales(
-    frame: Frame, theta: FloatArray, config: Config
-) -> tuple[FloatArray, FloatArray]:
-    """Log length-scales by the model; returns as `latent_log_length_scales`."""
-    if config.length_scale.model == 'latent':
-        return latent_log_length_scales(frame, theta)
-    return given_log_length_scales(frame, config.length_scale)
+    return GroundSurface(knots, mean + frame.prior_mean, std, inliers.inlier), knot_u, u
 
 
 OBSTACLE_DEPTH = 1.0
@@ -134,35 +114,16 @@ ROUNDING = 1e-12
 predicted variance could be negative."""
 
 
-class SegmentSurfaces(NamedTuple):
-    """The surface of each segment by itself."""
+RISES_ON = 0.8
+"""Part of the slope to a candidate with which the ground behind it must rise on."""
+
+
+class Grown(NamedTuple):
+    """Inliers of segments."""
 
     inlier: BoolArray  # (C,) candidates that the surface rests on
-    # (M, K) height about the prior mean and its standard deviation at the knots [m]; NaN where
-    # there is none
-    mean: FloatArray
-    std: FloatArray
-
-    @classmethod
-    def empty(cls, n_candidates: int, shape: tuple[int, ...]) -> SegmentSurfaces:
-        """No inlier, no surface."""
-        none = np.zeros(n_candidates, dtype=np.bool_)
-        return cls(none, *np.full((2, *shape), np.nan))
-
-
-class _Model(NamedTuple):
-    """Values that the segments grow from."""
-
-    frame: Frame
-    sill: float  # variance of the process [m^2]
-    gate_noise: float  # variance of the noise of a single candidate [m^2]
-    z: FloatArray  # (C,) about the prior mean [m]
-    # (C,) variance of the noise with which a candidate is observed, unless it joins in doubt
-    noise: FloatArray
-    length_scale: FloatArray  # (C,) at the candidates [m]
-    knot_length_scale: FloatArray  # (M, K) at the knots [m]
-    seed: BoolArray  # (C,) candidates that start the inlier set
-    odds: float  # obstacles for each ground among the candidates; 0: none joins in doubt
+    alike: FloatArray  # (C,) candidates close to each, itself as well, see `noise_among`
+    doubt: FloatArray  # (C,) variance by which an inlier may be an obstacle [m^2]
 
 
 @shared
@@ -222,9 +183,10 @@ def posterior_covariance(
     l = np.exp(np.concatenate([u[own], knot_u[m, :n]]))  # noqa: E741
     sill, noise = variances_of(theta)
     prior = paciorek(r[:, None], l[:, None], r, l, sill)
-    prior += config.observation.slope_std**2 * np.outer(r, r)
+    prior += line_covariance(r[:, None], r, *line_variances(config.observation))
     if config.label.rule == 'roughness':
-        noise = noise_among(_count_near(candidates, np.exp(theta[3]))[own], noise)
+        alike = _count_near(candidates, np.exp(given_theta(config)[3]))
+        noise = noise_among(alike[own], noise)
     given, cross = prior[: len(own), : len(own)] + np.eye(len(own)) * noise, prior[: len(own)]
     cov = prior - cross.T @ np.linalg.solve(given, cross)
     cov = cov[len(own) :, len(own) :]
@@ -253,128 +215,159 @@ def noise_in_doubt(
     return noise + choose(residual > 0.0, doubt * spread, 0.0)
 
 
-def _grow_segments(
+def grow_inliers(
+    frame: Frame,
     segments: IntArray,
-    model: _Model,
+    seed: BoolArray,
+    odds: float,
     from_neighbours: Evidence,
     config: Config,
-    by_itself: SegmentSurfaces,
-) -> None:
-    """Inliers and surface of `segments`, into `by_itself`, with the evidence at candidates."""
-    by_itself.mean[segments] = by_itself.std[segments] = np.nan
-    offsets = model.frame.candidates.offsets
-    is_below = ~contradicts(*from_neighbours, model.z, model.gate_noise)
-    continues_line = model.frame.continues_line & is_below
-    model = model._replace(
-        frame=model.frame._replace(continues_line=continues_line), seed=model.seed & is_below
-    )
-    size = offsets[segments + 1] - offsets[segments]
+) -> Grown:
+    """Inliers of `segments`, which grow from seeds under the given hyper-parameters.
+
+    A candidate joins when the predictive standard deviation is at most
+    ``growth.max_std`` and its standardised residual is at most
+    ``growth.max_standardised_residual`` above the prediction, or
+    ``growth.max_standardised_depth`` below; or when the ground goes on to it from the inlier
+    before (see `goes_on`). This repeats until none joins (GP-INSAC of Chen et al. 2014; the
+    paper's outlier rejection). The gate is asymmetric because obstacles stand only above the
+    ground.
+
+    `seed` (C,) and `odds` are of `seeds`, `from_neighbours` (C,) is the evidence of the segments
+    beside each.
+    """
+    candidates, given = frame.candidates, given_theta(config)
+    u, _ = log_length_scales(frame, given, config)
+    z = candidates.z - frame.prior_mean
+    sill, gate_noise = variances_of(given)
+    largest = prior_variance(sill, config.observation, candidates.r.max(initial=0.0))
+    gate_noise = max(gate_noise, ROUNDING * largest)
+    odds = odds if config.label.rule == 'roughness' else 0.0
+    alike = _count_near(candidates, np.exp(given[3]) if odds > 0.0 else 0.0)
+    noise = noise_among(alike, gate_noise)
+    above = contradicts(*from_neighbours, z, gate_noise)
+    grown = Grown(np.zeros(len(z), np.bool_), alike, np.zeros(len(z)))
+    size = candidates.offsets[segments + 1] - candidates.offsets[segments]
     for batch in batches(np.concatenate([[0], np.cumsum(size)])):
-        _grow_batch(segments[batch], model, from_neighbours, config, by_itself)
-
-
-def _grow_batch(
-    segments: IntArray,
-    model: _Model,
-    from_neighbours: Evidence,
-    config: Config,
-    by_itself: SegmentSurfaces,
-) -> None:
-    frame, slope_std = model.frame, config.observation.slope_std
-    layout = Padded.of(segments, frame.candidates.offsets)
-    r = layout.take(frame.candidates.r)
-    is_wanted = np.isfinite(model.knot_length_scale[segments])
-    n_knots = int(is_wanted.sum(axis=1).max())
-    is_wanted = is_wanted[:, :n_knots]
-    knots = np.broadcast_to(frame.knots[:n_knots], is_wanted.shape)
-    knot_l = np.where(is_wanted, model.knot_length_scale[segments, :n_knots], 1.0)
-    batch = _Batch(
-        np.concatenate([r, knots], axis=1),
-        np.concatenate([layout.take(model.length_scale, 1.0), knot_l], axis=1),
-        model.sill,
-        slope_std,
-        layout.take(model.z),
-        model.gate_noise,
-        layout.take(model.noise),
-        layout.mask,
-        model.seed[layout.place] & layout.mask,
-        frame.continues_line[layout.place] & layout.mask,
-        frame.in_face[layout.place],
-        Evidence(layout.take(from_neighbours.height), layout.take(from_neighbours.precision)),
-    )
-    chosen, height, variance = _grow(batch, config.growth, model.odds)
-    by_itself.inlier[layout.place[layout.mask]] = chosen[layout.mask]
-    is_known = is_wanted & chosen.any(axis=1, keepdims=True)
-    n = chosen.shape[1]
-    std = np.sqrt(np.maximum(variance[:, n:], 0.0))
-    by_itself.mean[segments, :n_knots] = np.where(is_known, height[:, n:], np.nan)
-    by_itself.std[segments, :n_knots] = np.where(is_known, std, np.nan)
+        layout = Padded.of(segments[batch], candidates.offsets)
+        place, mask = layout.place, layout.mask
+        state = _Batch(
+            layout.take(candidates.r),
+            layout.take(np.exp(u), 1.0),
+            sill,
+            config.observation,
+            layout.take(z),
+            gate_noise,
+            layout.take(noise),
+            mask,
+            (seed & ~above)[place] & mask,
+            layout.take(frame.onward, -np.inf),
+            frame.in_face[place],
+            above[place],
+            Evidence(layout.take(from_neighbours.height), layout.take(from_neighbours.precision)),
+        )
+        chosen = _grow(state, config.growth, odds)
+        grown.inlier[place[mask]] = chosen[mask]
+        grown.doubt[place[mask]] = state.noise[mask] - noise[place[mask]]
+    return grown
 
 
 class _Batch(NamedTuple):
-    """Candidates of S segments, padded to n, and the knots behind them: N places in all."""
+    """Candidates of S segments, padded to n."""
 
-    r: FloatArray  # (S, N)
-    length_scale: FloatArray  # (S, N)
+    r: FloatArray  # (S, n)
+    length_scale: FloatArray  # (S, n)
     sill: float
-    slope_std: float
+    observation: ObservationConfig
     z: FloatArray  # (S, n) about the prior mean
     gate_noise: float  # variance of the noise of a candidate
     # (S, n) variance of that with which it is observed; grows where it joins in doubt
     noise: FloatArray
     mask: BoolArray  # (S, n)
     seed: BoolArray  # (S, n)
-    continues_line: BoolArray  # (S, n)
+    onward: FloatArray  # (S, n)
     in_face: BoolArray  # (S, n)
+    above: BoolArray  # (S, n) the evidence contradicts it
     from_neighbours: Evidence  # (S, n)
 
 
-@np.errstate(over='ignore')  # the square of 1e200 m: no fit
-def _grow(
-    batch: _Batch, growth: GrowthConfig, odds: float
-) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Inliers of each segment, (S, n), and height and variance at all places, (S, N).
+@np.errstate(over='ignore', invalid='ignore')  # the square of 1e200 m: no fit; -inf times 0
+def _grow(batch: _Batch, growth: GrowthConfig, odds: float) -> BoolArray:
+    """Inliers of each segment, (S, n).
 
     The noise of the inliers is set, see `noise_in_doubt`, unless `odds` are 0. Candidates that
-    join in a round are conditioned on at once: their rows of ``L^-1 K(inliers, all places)`` are
+    join in a round are conditioned on at once: their rows of ``L^-1 K(inliers, candidates)`` are
     appended to those of the rounds before, and nothing is factored twice.
     """
-    n_segments, n = batch.seed.shape
     chosen = np.zeros_like(batch.seed)
-    height, variance = np.zeros_like(batch.r), prior_variance(batch.sill, batch.slope_std, batch.r)
+    variance = prior_variance(batch.sill, batch.observation, batch.r)
+    height = np.zeros_like(batch.r)
     # Segments that still grow, and the whitened rows of their inliers.
-    active, joining = np.arange(n_segments), batch.seed
-    whitened = np.empty((n_segments, 0, variance.shape[1]))
+    active, joining = np.arange(len(chosen)), batch.seed
+    whitened = np.empty((len(chosen), 0, variance.shape[1]))
     if odds > 0.0:
-        predicted = combined(0.0, variance[:, :n], *batch.from_neighbours)
+        predicted = combined(0.0, variance, *batch.from_neighbours)
         doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, True, odds)
         batch.noise[:] = np.where(joining & batch.in_face, doubtful, batch.noise)
     while len(active):
         chosen |= joining
         if joining.any():
             whitened = _condition(batch, active, joining[active], whitened, height, variance)
-        following = np.zeros_like(chosen)
-        following[:, 1:] = batch.continues_line[:, 1:] & chosen[:, :-1]
-        predicted = combined(height[:, :n], variance[:, :n], *batch.from_neighbours)
-        joining = fits(batch.z, *predicted, batch.gate_noise, growth) | following
-        joining &= ~chosen & batch.mask
+        predicted = combined(height, variance, *batch.from_neighbours)
+        fitting = fits(batch.z, *predicted, batch.gate_noise, growth)
         # Before anything has joined, only the evidence of neighbours decides.
-        joining &= chosen.any(axis=1, keepdims=True) | (batch.from_neighbours.precision > 0.0)
+        may_join = ~chosen & batch.mask
+        may_join &= chosen.any(axis=1, keepdims=True) | (batch.from_neighbours.precision > 0.0)
         if odds > 0.0:
             doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, batch.in_face, odds)
-            batch.noise[:] = np.where(joining & ~following, doubtful, batch.noise)
+            batch.noise[:] = np.where(may_join & fitting, doubtful, batch.noise)
+        joining = may_join & (fitting | _on_slope(batch, chosen, fitting, growth))
         grows = joining[active].any(axis=1)
         active, whitened = active[grows], whitened[grows]
-    return chosen, height, variance
+    return chosen
 
 
-def _prior_rows(batch: _Batch, segment: IntArray, place: IntArray) -> FloatArray:
-    """Prior covariance of places (P,), of segments (P,), with all places, (P, N)."""
+def _on_slope(
+    batch: _Batch, chosen: BoolArray, fitting: BoolArray, growth: GrowthConfig
+) -> BoolArray:
+    """Candidates to which the ground goes on from the last of those `chosen`, (S, n).
+
+    Behind one that stands on it, or is in a face, it does not, until the next that is chosen.
+    """
+    own, place = np.arange(len(chosen))[:, None], np.arange(chosen.shape[1])
+
+    def last(marked: BoolArray) -> IntArray:
+        """Place of the last one `marked` before each, -1 if none."""
+        found = np.maximum.accumulate(np.where(marked, place, -1), axis=1)
+        return np.concatenate([np.full((len(found), 1), -1), found[:, :-1]], axis=1)
+
+    before = last(chosen)
+    rise = batch.z - batch.z[own, before]
+    distance = batch.r - batch.r[own, before]
+    walkable = is_walkable(rise, distance, growth.max_slope) & ~batch.in_face & ~batch.above
+    is_open = (before >= 0) & (last(~chosen & ~fitting & ~walkable) < before)
+    result: BoolArray = is_open & walkable & goes_on(rise, distance, batch.onward)
+    return result
+
+
+@shared
+def goes_on(rise: Values, distance: Values, onward: Values) -> Values:
+    """Whether ground that rises so much [m] over a distance [m] goes on so.
+
+    `onward` is the slope behind: where it is less, the ground has come to an object. Ground that
+    falls needs no more evidence, as obstacles lie only above it.
+    """
+    return (rise <= 0.0) | (RISES_ON * rise <= onward * distance)
+
+
+def _rows(
+    batch: _Batch, segment: IntArray, place: IntArray
+) -> FloatArray:
+    """Prior covariance of places (P,), of segments (P,), with all places, (P, n)."""
     r, length_scale = batch.r[segment], batch.length_scale[segment]
     own_r, own_l = batch.r[segment, place][:, None], batch.length_scale[segment, place][:, None]
     rows: FloatArray = paciorek(own_r, own_l, r, length_scale, batch.sill)
-    rows += batch.slope_std**2 * own_r * r
-    return rows
+    return rows + line_covariance(own_r, r, *line_variances(batch.observation))
 
 
 def _condition(
@@ -387,7 +380,7 @@ def _condition(
 ) -> FloatArray:
     """Change height and variance of segments by observing those that are `new`.
 
-    Returns their rows, (A, m + n_new, N), behind those `whitened`, (A, m, N).
+    Returns their rows, (A, m + n_new, n), behind those `whitened`, (A, m, n).
     """
     # Places of the new ones, first in each row; the rest is padding.
     own, segment, n_new = np.arange(len(new))[:, None], active[:, None], new.sum(axis=1)
@@ -395,7 +388,7 @@ def _condition(
     is_new = np.arange(place.shape[1]) < n_new[:, None]
     which, rank = np.nonzero(is_new)
     rows = np.zeros((*place.shape, batch.r.shape[1]))
-    rows[which, rank] = _prior_rows(batch, active[which], place[which, rank])
+    rows[which, rank] = _rows(batch, active[which], place[which, rank])
     if whitened.size:
         rows -= np.matmul(whitened[own, :, place], whitened)
     within = rows[own, :, place]
@@ -407,3 +400,44 @@ def _condition(
     height[active] += np.matmul(innovation.swapaxes(1, 2), rows)[:, 0]
     variance[active] -= np.einsum('sij,sij->sj', rows, rows)
     return np.concatenate([whitened, rows], axis=1)
+
+
+def _regress(
+    frame: Frame, segments: IntArray, inliers: Grown, theta: FloatArray, config: Config
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Surface of `segments` by themselves, by their inliers and `theta`.
+
+    Returns height about the prior mean and standard deviation at the knots, (M, K) [m], NaN where
+    there is none, and log length-scales at the knots, (M, K), and the candidates, (C,) [log m].
+    """
+    candidates, which = frame.candidates, np.flatnonzero(inliers.inlier)
+    u, knot_u = log_length_scales(frame, theta, config)
+    mean, std = np.full((2, *knot_u.shape), np.nan)
+    sill, noise = variances_of(theta)
+    line = line_variances(config.observation)
+    r, z, length_scale = candidates.r, candidates.z - frame.prior_mean, np.exp(u)
+    largest = prior_variance(sill, config.observation, r.max(initial=0.0))
+    noise = noise_among(inliers.alike, max(noise, ROUNDING * largest)) + inliers.doubt
+    offsets = np.searchsorted(which, candidates.offsets)
+    size = offsets[segments + 1] - offsets[segments]
+    for batch in batches(np.concatenate([[0], np.cumsum(size)])):
+        own = segments[batch]
+        layout = Padded.of(own, offsets)
+        take = lambda values, fill=0.0: layout.take(values[which], fill)  # noqa: E731
+        own_r, own_l = take(r)[:, :, None], take(length_scale, 1.0)[:, :, None]
+        is_wanted = np.isfinite(knot_u[own])
+        n_knots = int(is_wanted.sum(axis=1).max())
+        is_wanted, knots = is_wanted[:, :n_knots], frame.knots[:n_knots]
+        knot_l = np.where(is_wanted, np.exp(knot_u[own, :n_knots]), 1.0)[:, None]
+        within = paciorek(own_r, own_l, own_r.swapaxes(1, 2), own_l.swapaxes(1, 2), sill)
+        within += line_covariance(own_r, own_r.swapaxes(1, 2), *line)
+        add_noise(within, take(noise), layout.mask)
+        unit = inverse_of_lower(np.linalg.cholesky(within)) * layout.mask[:, :, None]
+        rows = paciorek(own_r, own_l, knots, knot_l, sill) + line_covariance(own_r, knots, *line)
+        rows = np.matmul(unit, rows)
+        height = np.matmul(np.matmul(unit, take(z)[:, :, None]).swapaxes(1, 2), rows)[:, 0]
+        variance = prior_variance(sill, config.observation, knots)
+        variance = variance - np.einsum('sij,sij->sj', rows, rows)
+        mean[own, :n_knots] = np.where(is_wanted, height, np.nan)
+        std[own, :n_knots] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+    return mean, std, knot_u, u

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, Values
 from gp_ground_seg.core.jit import shared
+from gp_ground_seg.core.parameters.config import ObservationConfig
 
 try:
     from threadpoolctl import ThreadpoolController
@@ -60,9 +61,28 @@ def squared_exponential(r_a: Values, r_b: Values, variance: Values, sharpness: V
 
 
 @shared
-def prior_variance(sill: Values, slope_std: float, r: Values) -> Values:
-    """Prior variance of the ground's height at ranges [m^2]: of the process, and of its slope."""
-    return sill + slope_std * slope_std * r * r
+def line_covariance(r_a: Values, r_b: Values, slope: Values, sixth: Values) -> Values:
+    """Covariance of the mean line's heights at two ranges [m^2].
+
+    The line leaves the sensor's base with a slope of variance `slope`, and its slope walks: that
+    adds ``drift^2 r^2 (3 r' - r) / 6``, with r the nearer range (an integrated Wiener process).
+    `sixth` is ``drift^2 / 6`` [1/m], where ``drift^2`` is the variance that the slope gains over a
+    metre.
+    """
+    near, far = np.minimum(r_a, r_b), np.maximum(r_a, r_b)
+    return near * (slope * far + sixth * near * (far + far + far - near))
+
+
+@shared
+def line_variances(observation: ObservationConfig) -> tuple[float, float]:
+    """Return the last two arguments of `line_covariance`."""
+    return observation.slope_std**2, observation.slope_drift**2 / 6.0
+
+
+@shared
+def prior_variance(sill: Values, observation: ObservationConfig, r: Values) -> Values:
+    """Prior variance of the ground's height at ranges [m^2]: of the process, and of its line."""
+    return sill + line_covariance(r, r, *line_variances(observation))
 
 
 class Padded(NamedTuple):

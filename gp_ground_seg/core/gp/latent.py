@@ -6,13 +6,37 @@ import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Frame, IntArray
 from gp_ground_seg.core.gp.kernels import Padded, add_noise, batches, squared_exponential
-from gp_ground_seg.core.parameters.config import LengthScaleConfig
+from gp_ground_seg.core.parameters.config import Config, LengthScaleConfig
+from gp_ground_seg.core.pipeline.lines import N_CLASSES
 
 MAX_ABS_LOG_LENGTH_SCALE = 100.0
 """Bound of the latent process [log m], far outside all scans, for squares that stay finite.
 
 With `latent.sigma_f_bar` near its upper end the mean between pseudo-inputs swings that far.
 """
+
+
+def given_theta(config: Config) -> FloatArray:
+    """Values given by the configuration, (T,), in log space; T is 6, with classes 14."""
+    observation, latent = config.observation, config.latent
+    values = (
+        observation.sigma_f,
+        observation.sigma_n,
+        latent.sigma_f_bar,
+        latent.sigma_l_bar,
+        latent.sigma_n_bar,
+    )
+    n_factors = N_CLASSES if config.learning.length_scale == 'classes' else 1
+    return np.append(np.log(values), np.zeros(n_factors))
+
+
+def log_length_scales(
+    frame: Frame, theta: FloatArray, config: Config
+) -> tuple[FloatArray, FloatArray]:
+    """Log length-scales by the model of the configuration, as of `latent_log_length_scales`."""
+    if config.length_scale.model == 'latent':
+        return latent_log_length_scales(frame, theta)
+    return given_log_length_scales(frame, config.length_scale)
 
 
 def n_wanted_knots(frame: Frame) -> IntArray:

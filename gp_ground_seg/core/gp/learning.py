@@ -26,10 +26,12 @@ from gp_ground_seg.core.frame import (
     PseudoInputs,
     Values,
 )
-from gp_ground_seg.core.gp.ground import estimate_surface
+from gp_ground_seg.core.gp.evidence import Evidence, seeds
+from gp_ground_seg.core.gp.ground import grow_inliers
+from gp_ground_seg.core.gp.latent import given_theta, log_length_scales
 from gp_ground_seg.core.gp.likelihood import log_likelihood
 from gp_ground_seg.core.jit import shared
-from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.parameters.config import Config, ObservationConfig
 from gp_ground_seg.core.pipeline.lines import N_CLASSES, class_middles
 
 THETA_NAMES = (
@@ -39,8 +41,6 @@ THETA_NAMES = (
 
 WIDEST = 5.0
 """Distance from the given value to the bounds, in standard deviations of the prior."""
-FARTHEST_START = 5.0
-"""Distance of the start of learning from the given values, at most: a factor of 148."""
 AT_BOUND = 1e-6
 """Distance to a bound at which an entry counts as at it."""
 BUDGET, CONVERGED, FAILED = range(3)
@@ -74,20 +74,6 @@ def theta_names(n: int) -> tuple[str, ...]:
     return THETA_NAMES if n == len(THETA_NAMES) else (*names, *numbered)
 
 
-def given_theta(config: Config) -> FloatArray:
-    """Values given by the configuration, (T,), in log space; T is 6, with classes 14."""
-    observation, latent = config.observation, config.latent
-    values = (
-        observation.sigma_f,
-        observation.sigma_n,
-        latent.sigma_f_bar,
-        latent.sigma_l_bar,
-        latent.sigma_n_bar,
-    )
-    n_factors = N_CLASSES if config.learning.length_scale == 'classes' else 1
-    return np.append(np.log(values), np.zeros(n_factors))
-
-
 @lru_cache(maxsize=4)
 def theta_space(config: Config) -> ThetaSpace:
     """Bounds, priors and free entries by the configuration; not to be written to."""
@@ -106,46 +92,6 @@ def theta_space(config: Config) -> ThetaSpace:
         lower[5:] = math.log(limits.min) - class_middles(limits)
         upper[5:] = math.log(limits.max) - class_middles(limits)
     return ThetaSpace(centre, lower, upper, free, learning.prior_std)
-
-
-def first_theta(frame: Frame, config: Config) -> FloatArray:
-    """Where learning begins, (T,), in log space: what the lines show, else the given values.
-
-    sigma_f is the root mean square height, over the prior mean, of the near candidates on
-    lines that may be ground. sigma_n follows from the distances of candidates
-    to the line through the two beside them. Both are cut at ``growth.seed_height_tolerance``, and
-    kept within `FARTHEST_START` of the given values: lines without any noise would make
-    covariances singular.
-    """
-    candidates, lines, growth = frame.candidates, frame.lines, config.growth
-    theta, r, line = given_theta(config), candidates.r, lines.line
-    is_ground = np.abs(lines.slope) <= growth.max_line_slope
-    is_ground &= np.diff(lines.start) >= growth.min_line_size
-    height = candidates.z - frame.prior_mean
-    height = height[is_ground[line] & (r <= growth.seed_range)]
-    inner, z = np.flatnonzero(line[2:] == line[:-2]) + 1, candidates.z
-    before, behind = (r[inner - 1], z[inner - 1]), (r[inner + 1], z[inner + 1])
-    missed = missed_by_line(before, (r[inner], z[inner]), behind)
-    for i, values in enumerate((height, missed)):
-        values = np.minimum(np.abs(values), growth.seed_height_tolerance)
-        mean_square = float(values @ values) / max(len(values), 1)
-        if mean_square > 0.0:
-            theta[i] = 0.5 * math.log(mean_square)
-    given = given_theta(config)
-    return np.clip(theta, given - FARTHEST_START, given + FARTHEST_START)
-
-
-@shared
-def missed_by_line(
-    before: tuple[Values, Values], point: tuple[Values, Values], behind: tuple[Values, Values]
-) -> Values:
-    """Distance of a height from the line through the two beside it, all with noise [m].
-
-    Divided so that its standard deviation is that of the noise. Points are range and height [m].
-    """
-    share = (point[0] - before[0]) / (behind[0] - before[0])
-    missed = point[1] - (1.0 - share) * before[1] - share * behind[1]
-    return missed / np.sqrt(1.0 + share * share + (1.0 - share) * (1.0 - share))
 
 
 class Learned(NamedTuple):
@@ -174,29 +120,22 @@ class Learned(NamedTuple):
 
 
 def learn_frame(frame: Frame, config: Config) -> Learned:
-    """Learn theta on the inliers that grow under it, then on those under what was learned, ...
+    """Learn theta on the inliers that grow under the values given, of some segments.
 
-    It ends when the inliers of a later round are no more than before, or when
-    ``learning.max_evaluations`` are spent; the first round has half of them. Every
-    ``learning.segment_step``-th segment is used.
+    These are every ``learning.segment_step``-th, each by itself.
     """
-    learning, space = config.learning, theta_space(config)
+    learning, space, theta = config.learning, theta_space(config), given_theta(config)
     thin = every_segment(frame, learning.segment_step)
     has_latent = bool(space.free[2:].any())
-    is_map, slope_std = learning.objective == 'map', config.observation.slope_std
-    theta, outcome = first_theta(frame, config), np.array([-math.inf, BUDGET])
-    n_rounds = n_before = n_evaluations = 0
-    budget = max(learning.max_evaluations // 2, 1)
-    while budget > 0:
-        surface, _, u = estimate_surface(thin, theta, config)
-        inliers = take_inliers(thin, surface.inlier, u, has_latent)
-        n_rounds += 1
-        if n_rounds > 2 and len(inliers.r) <= n_before:
-            break
-        n_before = len(inliers.r)
-        n_evaluations += maximise(space, inliers, slope_std, is_map, budget, theta, outcome)
-        budget = learning.max_evaluations - n_evaluations
-    return Learned.of(theta, float(outcome[0]), n_evaluations, int(outcome[1]), space)
+    everywhere, outcome = np.arange(thin.candidates.n_segments), np.empty(2)
+    seed, odds = seeds(thin, theta, config)
+    nothing = Evidence(*np.zeros((2, len(seed))))
+    grown = grow_inliers(thin, everywhere, seed, odds, nothing, config)
+    u, _ = log_length_scales(thin, theta, config)
+    inliers = take_inliers(thin, grown.inlier, u, has_latent)
+    is_map, most = learning.objective == 'map', learning.max_evaluations
+    n = maximise(space, inliers, config.observation, is_map, most, theta, outcome)
+    return Learned.of(theta, float(outcome[0]), n, int(outcome[1]), space)
 
 
 def every_segment(frame: Frame, step: int) -> Frame:
@@ -215,7 +154,7 @@ def every_segment(frame: Frame, step: int) -> Frame:
             pseudo.line[kept_bar],
             pseudo.kind[kept_bar],
         ),
-        continues_line=frame.continues_line[kept],
+        onward=frame.onward[kept],
         in_face=frame.in_face[kept],
         knots=frame.knots[:0],
     )
@@ -244,12 +183,12 @@ def take_inliers(frame: Frame, inlier: BoolArray, u: FloatArray, has_latent: boo
 def set_likelihood(
     theta: FloatArray,
     inliers: Inliers,
-    slope_std: float,
+    observation: ObservationConfig,
     latent_terms: bool,
     gradient: FloatArray,
 ) -> float:
     """Return the value of `log_likelihood`, and set its `gradient` (T,)."""
-    value, gradient[:] = log_likelihood(theta, inliers, slope_std, latent_terms)
+    value, gradient[:] = log_likelihood(theta, inliers, observation, latent_terms)
     return value
 
 
@@ -257,7 +196,7 @@ def set_likelihood(
 def maximise(
     space: ThetaSpace,
     inliers: Inliers,
-    slope_std: float,
+    observation: ObservationConfig,
     is_map: bool,
     max_evaluations: int,
     theta: FloatArray,
@@ -283,7 +222,7 @@ def maximise(
     while n_evaluations < max_evaluations:
         for i in range(len(theta)):
             theta[i] = search.trial[i]
-        value = set_likelihood(theta, inliers, slope_std, not is_map, slope)
+        value = set_likelihood(theta, inliers, observation, not is_map, slope)
         for i in range(len(theta)):
             if not space.free[i]:
                 slope[i] = 1.0  # it stays at its upper bound

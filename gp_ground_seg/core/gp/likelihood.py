@@ -8,23 +8,29 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Inliers, IntArray
-from gp_ground_seg.core.gp.kernels import paciorek, single_threaded_blas, squared_exponential
+from gp_ground_seg.core.gp.kernels import (
+    line_covariance,
+    line_variances,
+    paciorek,
+    single_threaded_blas,
+    squared_exponential,
+)
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
+from gp_ground_seg.core.parameters.config import ObservationConfig
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
 @single_threaded_blas()
 def log_likelihood(
-    theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
+    theta: FloatArray, inliers: Inliers, observation: ObservationConfig, latent_terms: bool
 ) -> tuple[float, FloatArray]:
     """Log marginal likelihood of a frame and its gradient (paper, eqs. 19 and 20).
 
     `theta`, (T,), holds the logarithms of sigma_f, sigma_n [m], sigma_f_bar [log m],
     sigma_l_bar [m], sigma_n_bar [log m], and of the factors on the length-scales of the lines.
-    `slope_std` is the prior standard deviation of the mean line's slope: the line through the
-    sensor's base is marginalised, which adds ``slope_std^2 r r'`` to the kernel (Rasmussen and
-    Williams 2006, section 2.7). With `latent_terms` the terms of the latent process,
+    `observation` has the prior of the mean line: it is marginalised, which adds `line_covariance`
+    to the kernel (Rasmussen and Williams 2006, section 2.7). With `latent_terms` the terms of the latent process,
     ``-1/2 log|B_m|``, are in: the objective is the printed one, which has no upper bound.
 
     Returns the value, ``-inf`` where a covariance is not positive definite, and its gradient in
@@ -33,7 +39,7 @@ def log_likelihood(
     value, gradient = 0.0, np.zeros(len(theta))
     try:
         for m in np.flatnonzero(np.diff(inliers.offsets)).tolist():
-            value += _add_segment(theta, gradient, inliers, m, slope_std, latent_terms)
+            value += _add_segment(theta, gradient, inliers, m, observation, latent_terms)
     except np.linalg.LinAlgError:
         value = -math.inf
     if not math.isfinite(value):
@@ -46,7 +52,7 @@ def _add_segment(
     gradient: FloatArray,
     inliers: Inliers,
     m: int,
-    slope_std: float,
+    observation: ObservationConfig,
     latent_terms: bool,
 ) -> float:
     """Value of segment `m`; adds to `gradient`. Letters are those of the paper."""
@@ -60,7 +66,8 @@ def _add_segment(
     sigma_f, sigma_n = np.exp(theta[:2])
     length_scale = np.exp(u)
     k = paciorek(r[:, None], length_scale[:, None], r, length_scale, sigma_f**2)
-    covariance = k + slope_std**2 * np.outer(r, r) + sigma_n**2 * np.eye(len(r))
+    covariance = k + line_covariance(r[:, None], r, *line_variances(observation))
+    covariance += sigma_n**2 * np.eye(len(r))
     factor = np.linalg.cholesky(covariance)
     a_inverse = np.linalg.inv(covariance)
     alpha = a_inverse @ z

@@ -176,6 +176,9 @@ class ObservationConfig(ParameterGroup):
         'standard deviation of the height noise of a ground candidate', 'm', 'sigma_n')
     slope_std: float = advanced(0.05, (0.0, 2.0),
         "prior standard deviation of the mean line's slope; 0 = a level mean")
+    slope_drift: float = advanced(0.01, (0.0, 1.0),
+        "standard deviation that the mean line's slope gains over a metre, and over others with "
+        'the square root of the distance; 0 = a straight line')
 
 
 @dataclass(frozen=True)
@@ -202,19 +205,18 @@ class GrowthConfig(ParameterGroup):
         'largest height of a seed above or below the expected ground; in proportion to the height '
         'of a sensor below 1 m; larger: a ramp near the sensor can be ground, and so can a low '
         'object', 'm')
-    max_std: float = advanced(0.35, (0.001, 10.0),
+    max_std: float = advanced(0.25, (0.001, 10.0),
         'predictive standard deviation above which a candidate is not decided yet; in proportion '
         'to the height of a sensor below 1 m', 'm')
     max_standardised_residual: float = advanced(3.0, (0.1, 50.0),
         'residual over predictive standard deviation above which a candidate is an outlier')
     max_standardised_depth: float = advanced(5.0, (0.1, 200.0),
         'the same for a candidate below the prediction; obstacles lie only above')
-    max_line_slope: float = advanced(0.2, (0.0, 10.0),
-        'maximum slope of a line whose candidates may join because they continue its inliers')
-    min_line_size: int = advanced(4, (2, 10000), 'minimum number of candidates of such a line')
-    min_bend_extent: float = advanced(10.0, (0.1, 1000.0),
-        'minimum length of a line that may join after a slope break; more than the length of '
-        'objects', 'm')
+    max_slope: float = advanced(0.2, (0.0, 10.0),
+        'largest slope with which the ground goes on from an inlier to a candidate that the gate '
+        'rejects; 0 = the gate alone decides')
+    min_rise_extent: float = advanced(3.0, (0.1, 1000.0),
+        'distance over which ground that rises so must rise on', 'm')
 
 
 @dataclass(frozen=True)
@@ -408,12 +410,12 @@ _PRESETS = (
             'lines.max_gap_growth': (0.15, "not printed; chosen for the rings of KITTI's sensor"),
             'length_scale.model': ('latent', 'section III-B'),
             'observation.slope_std': (0.0, 'the equations have a level mean'),
+            'observation.slope_drift': (0.0, 'the equations have a level mean'),
             'surface.look_aside': (False, 'each segment has a surface of its own'),
             'growth.max_std': (0.4, 'not printed; chosen for segments by themselves'),
             'growth.max_standardised_residual': (2.0, 'a gate alike above and below'),
             'growth.max_standardised_depth': (2.0, 'a gate alike above and below'),
-            'growth.max_line_slope': (0.0, 'the gate alone decides'),
-            'growth.min_bend_extent': (1000.0, 'the gate alone decides'),
+            'growth.max_slope': (0.0, 'the gate alone decides'),
             'faces.max_normal_z': (0.0, 'no faces'),
             'faces.max_foot_distance': (0.0, 'no faces'),
             'label.ground_tolerance': (0.2, 'zeta_g, not printed: one for all'),

@@ -66,10 +66,10 @@ def label_points(
     height = over_relief(scan, z, relief) - at_points(surface.knots, surface.mean, grid)
     tile = as_index(tiles.tile)
     in_face = faces.is_face[tile] & grid.inside
-    units = sum_units(len(z))
-    roughness = ground_roughness(tiles, _near_sums(height, tiles, in_face, units), units)
-    band = np.full(len(roughness), label.ground_tolerance)
+    roughness, band = np.full((2, len(tiles.place) + 1), [[0.0], [label.ground_tolerance]])
     if label.rule == 'roughness':
+        units = sum_units(len(z))
+        roughness = ground_roughness(tiles, _near_sums(height, tiles, in_face, units), units)
         band = ground_band(roughness, label)
     margin: FloatArray = band_margin(height, band[tile], depth_of_ground(label))
     of_face = np.flatnonzero(in_face)

@@ -18,6 +18,7 @@ from gp_ground_seg.core.frame import (
     FloatArray,
     Lines,
     PseudoInputs,
+    Values,
 )
 from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import (
@@ -29,8 +30,8 @@ from gp_ground_seg.core.parameters.config import (
 )
 from gp_ground_seg.core.parameters.schema import numbers_of
 
-MIN_BREAK_CANDIDATES = 3
-"""Candidates that a line after a slope break needs: through two there is always one."""
+UNEVEN = 0.25
+"""Distance that is added to that over which the ground rises, as it is not smooth [m]."""
 N_CLASSES = 9
 """Classes of lines that share a length-scale."""
 
@@ -43,11 +44,11 @@ def find_lines(
     faces: Faces,
     config: Config,
     trace_lines: Callable[..., tuple[int, int]] | None = None,
-) -> tuple[Candidates, Lines, PseudoInputs, BoolArray, BoolArray]:
+) -> tuple[Candidates, Lines, PseudoInputs, FloatArray, BoolArray]:
     """Lines through the candidates that show ground, and what follows from the lines.
 
     The lowest point of a face with occluded base is no candidate. Returns the candidates kept,
-    lines, pseudo-inputs, and which candidates continue a line and which are in faces.
+    lines, pseudo-inputs, how the ground goes on behind each, and which are in faces.
     `trace_lines` is `trace`, compiled or not.
     """
     candidates = candidates.where(~faces.has_occluded_base[candidates.tile])
@@ -56,29 +57,29 @@ def find_lines(
     offsets = np.empty(len(candidates.offsets), np.int64)
     line, kind = np.empty((2, n), np.int64)
     pseudo = PseudoInputs(np.empty(n), np.empty(n), offsets, line, kind)
-    continues_line = np.empty(n, np.bool_)
+    onward = np.empty(n)
     groups: Any = tuple(
         map(numbers_of, (config.lines, config.growth, config.latent, config.length_scale))
     )
     is_break = find_breaks(candidates.r, candidates.density, config.lines)
     n_lines, n_pseudo = (trace_lines or _trace_lists)(
-        candidates, is_break, groups, lines, pseudo, continues_line
+        candidates, is_break, groups, lines, pseudo, onward
     )
     lines = Lines(lines.line, lines.slope[:n_lines], lines.start[: n_lines + 1])
     n = n_pseudo
     pseudo = PseudoInputs(pseudo.r_bar[:n], pseudo.log_extent[:n], offsets, line[:n], kind[:n])
     if config.learning.length_scale == 'classes':
         pseudo = shared_by_class(lines, pseudo, config.length_scale)
-    return candidates, lines, pseudo, continues_line, faces.is_face[candidates.tile]
+    return candidates, lines, pseudo, onward, faces.is_face[candidates.tile]
 
 
 def _trace_lists(
     candidates: Candidates, is_break: BoolArray, groups: Groups, *results: Any
 ) -> tuple[int, int]:
     """Do what `trace` does: plain Python reads lists, and writes views, faster than arrays."""
-    lines, pseudo, continues_line = results
+    lines, pseudo, onward = results
     *inputs, breaks = (column.tolist() for column in (*candidates, is_break))
-    views: Any = [memoryview(array) for array in (*lines, *pseudo, continues_line)]
+    views: Any = [memoryview(array) for array in (*lines, *pseudo, onward)]
     results = Lines(*views[:3]), PseudoInputs(*views[3:8]), views[8]
     return trace(Candidates(*inputs), breaks, groups, *results)
 
@@ -126,7 +127,7 @@ def trace(
     groups: Groups,
     lines: Lines,
     pseudo: PseudoInputs,
-    continues_line: BoolArray,
+    onward: FloatArray,
 ) -> tuple[int, int]:
     """Fill the last three; return the number of lines, and that of pseudo-inputs.
 
@@ -134,7 +135,7 @@ def trace(
     """
     tolerances, growth, latent, limits = groups
     n_lines = extract_lines(candidates, is_break, tolerances, lines)
-    mark_continued(candidates, lines, n_lines, tolerances, growth, continues_line)
+    find_onward(candidates, growth, onward)
     return n_lines, select_pseudo_inputs(candidates, lines, n_lines, latent, limits, pseudo)
 
 
@@ -275,60 +276,25 @@ def select_pseudo_inputs(
 
 
 @shared
-def mark_continued(
-    candidates: Candidates,
-    lines: Lines,
-    n_lines: int,
-    tolerances: LinesConfig,
-    growth: GrowthConfig,
-    continues_line: BoolArray,
-) -> None:
-    """Mark the candidates that join the inliers if the one before them has joined.
+def find_onward(candidates: Candidates, growth: GrowthConfig, onward: FloatArray) -> None:
+    """Slope with which the ground goes on behind each candidate, into `onward` (C,).
 
-    They continue a line that is longer and flatter than an obstacle, or their line starts
-    at a slope break (see `meets_line_before`).
+    Over at least two more candidates and ``growth.min_rise_extent``, with no step between two;
+    -inf where it does not.
     """
-    r, offsets = candidates.r, candidates.offsets
-    m = 0
-    for q in range(n_lines):
-        first, stop = lines.start[q], lines.start[q + 1]
-        while offsets[m] < first:
-            m += 1
-        is_flat = abs(lines.slope[q]) <= growth.max_line_slope
-        is_long = r[stop - 1] - r[first] >= growth.min_bend_extent
-        at_break = False
-        if is_flat and is_long and stop - first >= MIN_BREAK_CANDIDATES and offsets[m] != first:
-            before = lines.slope[q - 1]
-            # A single candidate, or one above the other, has no usable slope: level.
-            before = before if abs(before) <= growth.max_line_slope else 0.0
-            at_break = meets_line_before(
-                first, stop, candidates, before, lines.slope[q], tolerances.offset_tolerance
-            )
-        continues = at_break or (is_flat and stop - first >= growth.min_line_size)
-        continues_line[first] = at_break
-        for c in range(first + 1, stop):
-            continues_line[c] = continues
+    r, z, offsets = candidates.r, candidates.z, candidates.offsets
+    for m in range(len(offsets) - 1):
+        for c in range(offsets[m], offsets[m + 1]):
+            onward[c] = -math.inf
+            for j in range(c + 1, offsets[m + 1]):
+                if not is_walkable(z[j] - z[j - 1], r[j] - r[j - 1], growth.max_slope):
+                    break
+                if j > c + 1 and r[j] - r[c] >= growth.min_rise_extent:
+                    onward[c] = (z[j] - z[c] + growth.max_slope * UNEVEN) / (r[j] - r[c])
+                    break
 
 
 @shared
-def meets_line_before(
-    first: int, stop: int, candidates: Candidates, before: float, slope: float, tolerance: float
-) -> bool:
-    """Whether the line of candidates `first` to `stop` meets that before it in the gap between.
-
-    Where the slope of the ground changes, as at the start of a ramp between two rings, the
-    extended lines before and after intersect between the last candidate of the one and the
-    first of the other. At a step they do not: an obstacle's line passes over, or starts
-    over, the ground's. `before` and `slope` are those of the two lines.
-    """
-    r, z = candidates.r, candidates.z
-    mean_r = mean_z = 0.0
-    for c in range(first, stop):
-        mean_r += r[c] / (stop - first)
-        mean_z += z[c] / (stop - first)
-    last = first - 1
-    over_last = mean_z + slope * (r[last] - mean_r) - z[last]
-    over_line = z[first] - (z[last] + before * (r[first] - r[last]))
-    upwards = over_last <= tolerance and over_line >= -tolerance
-    meets: bool = upwards or (over_last >= -tolerance and over_line <= tolerance)
-    return meets
+def is_walkable(rise: Values, distance: Values, max_slope: Values) -> Values:
+    """Whether ground rises or falls by so much over a distance [m]: no more than a slope."""
+    return abs(rise) <= max_slope * (distance + UNEVEN)

@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.backend import Backend
-from gp_ground_seg.core.errors import DataError, PointCloudError, shown
+from gp_ground_seg.core.errors import PointCloudError, shown
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.semantic_kitti import Frame, read_entries, read_points
+from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.lab.cluster import HERE, Progress, Runner
 from gp_ground_seg.lab.scoring import metrics, objects
 from gp_ground_seg.lab.scoring.metrics import COUNTS, Labels
@@ -133,11 +133,8 @@ def load_kitti(frame: Frame, cut: float = 0.0) -> KnownScan:
 
     Objects are cut at the height `cut` [m] to count low things; with 0 none are.
     """
-    if frame.labels_path is None:
-        raise DataError(f'{frame.points_path}: has no labels')
-    points = read_points(frame.points_path, frame.columns)
-    entries = read_entries(frame.labels_path, len(points))
-    return labelled_scan(shown(frame.sequence), shown(frame.index), points, entries, cut)
+    names = shown(frame.sequence), shown(frame.index)
+    return labelled_scan(*names, frame.points, frame.entries, cut)
 
 
 def labelled_scan(
@@ -180,7 +177,7 @@ def score_rows(
     load: Callable[[Any], KnownScan],
     methods: Sequence[Method],
     items: Sequence[Any],
-    progress: Progress = iter,
+    progress: Progress,
     *,
     each_alone: bool,
 ) -> Rows:

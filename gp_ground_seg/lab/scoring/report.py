@@ -8,6 +8,7 @@ import platform
 import subprocess
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,7 +16,6 @@ import gp_ground_seg
 from gp_ground_seg.core.errors import require
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.files import write_file
-from gp_ground_seg.lab.cluster import package_versions
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -167,7 +167,10 @@ def describe_environment(*packages: str) -> dict[str, Any]:
         'cpu': _cpu_name(),
         'n_cores': len(os.sched_getaffinity(0)),
         'python': platform.python_version(),
-        'versions': package_versions(*packages),
+        'versions': {
+            'gp_ground_seg': gp_ground_seg.__version__,
+            **{name: _version_of(name) for name in ('numpy', 'scipy', 'numba', *packages)},
+        },
         'commit': _commit(Path(gp_ground_seg.__file__)),
     }
 
@@ -186,6 +189,12 @@ def machine_line(environment: Mapping[str, Any], backend: str) -> str:
         return machine  # installed, not run from a checkout
     commit, _, dirty = environment['commit'].partition('-')
     return f'{machine}, commit {commit[:12]}{" (changed since)" if dirty else ""}'
+
+
+def _version_of(package: str) -> str | None:
+    with suppress(PackageNotFoundError):
+        return version(package)
+    return None
 
 
 def _cpu_name() -> str:

@@ -246,23 +246,19 @@ def ditch(
     return polyline(heading, corners)
 
 
-def crest(
-    start: float, climb: float, gradient: float, rounding: float, heading: float = 0.0
-) -> Profile:
-    """Climb from u = `start` [m], rounded top, descent as steep; horizontal lengths [m]."""
+def crest(start: float, climb: float, gradient: float, rounding: float) -> Profile:
+    """Climb from x = `start` [m], rounded top, descent as steep; horizontal lengths [m]."""
     top, z, level = start + climb, gradient * climb, (0.0, 0.0, 0.0)
     edges = np.array([start, top, top + rounding, top + rounding + climb])
     up, down = (0.0, gradient, 0.0), (z, -gradient, 0.0)
     coefficients = np.array([level, up, (z, gradient, -gradient / rounding), down, level])
-    return Profile(heading, edges, np.array([start, *edges]), coefficients)
+    return Profile(0.0, edges, np.array([start, *edges]), coefficients)
 
 
-def smooth_then_rough(
-    rng: np.random.Generator, start: float, transition: float, rms: float = 0.15
-) -> Waves:
+def smooth_then_rough(rng: np.random.Generator, start: float, transition: float) -> Waves:
     """Flat ground that grows rough from x = `start` [m] on, fully so after `transition` [m]."""
     envelope = polyline(0.0, [(start, 0.0), (start + transition, 1.0)])
-    return rough(rng, rms, (0.8, 6.0), envelope=envelope)
+    return rough(rng, 0.15, (0.8, 6.0), envelope=envelope)
 
 
 def first_hit(

@@ -13,11 +13,11 @@ import numpy as np
 from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.lab.simulation.objects import (
     SMALLEST_RATE,
-    Box,
     Cylinder,
     Interval,
     Kind,
     Solid,
+    floating_box,
     parts_of,
 )
 from gp_ground_seg.lab.simulation.terrain import Terrain
@@ -151,16 +151,10 @@ def person(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
     )  # fmt: skip
 
 
-def cyclist(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Solid, ...]:
+def cyclist(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
     """Cyclist 1.75 m tall: the bicycle, legs, trunk and head."""
-    ground = float(terrain.height(x, y))
-    boxes = [
-        Box(
-            Kind.CYCLIST, x, y, ground + low, ground + high, 0.5 * math.hypot(length, width),
-            length, width, yaw,
-        )
-        for low, high, length, width in ((0.0, 0.68, 1.7, 0.06), (0.3, 0.95, 0.5, 0.32))
-    ]  # fmt: skip
+    sizes = (0.0, (1.7, 0.06, 0.68)), (0.3, (0.5, 0.32, 0.65))
+    boxes = [floating_box(terrain, x, y, size, low, Kind.CYCLIST) for low, size in sizes]
     parts = ((0.9, 1.5, 0.2), (1.45, 1.75, 0.11))
     rider = [_upright(terrain, Kind.CYCLIST, (x, y), *part) for part in parts]
     return parts_of(x, y, (*boxes, *rider))
