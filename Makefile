@@ -32,12 +32,12 @@ $(VENV)/.python:
 	@touch $@
 
 $(VENV)/.ros: setup.py $(VENV)/.python
-	@echo 'Installing gp_ground_seg, numba, matplotlib and ROS 2 Jazzy from PyPI into $(VENV) (about 600 MB) ...'
-	@$(BIN)/python scripts/install_with_progress.py 600 -e '.[ros]'
+	@echo 'Installing gp_ground_seg, numba, matplotlib and ROS 2 Jazzy from PyPI into $(VENV) ...'
+	@$(BIN)/python scripts/install_with_progress.py 180 -e '.[ros]'
 	@touch $@
 
 $(VENV)/.dev: setup.py $(VENV)/.ros
-	@echo 'Installing what the tests need into $(VENV) (about 100 MB) ...'
+	@echo 'Installing what the tests need into $(VENV) ...'
 	@$(BIN)/python scripts/install_with_progress.py 100 -e '.[ros,dev]'
 	@touch $@
 

@@ -56,7 +56,7 @@ DEV = [
 
 setup(
     name=PACKAGE,
-    version='0.4.0',  # a literal: catkin_prepare_release writes it here and into package.xml
+    version='0.5.0',  # a literal: catkin_prepare_release writes it here and into package.xml
     description='Ground segmentation of LiDAR scans with two coupled Gaussian processes',
     long_description=README.read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',

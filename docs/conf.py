@@ -38,7 +38,7 @@ def help_of(words):
     """Return what a command prints with --help."""
     from gp_ground_seg.cli.main import main
 
-    os.environ['COLUMNS'] = '92'
+    os.environ['COLUMNS'] = '80'
     printed = StringIO()
     with redirect_stdout(printed), suppress(SystemExit):
         main([*words, '--help'])

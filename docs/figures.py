@@ -15,7 +15,7 @@ drop: TITLE; TITLE     without the columns of these titles
 rows: PATTERN          only the rows in which this regular expression is found
 picture: FILE -> PATH  the file that the command makes, and its place in the repository
 
-A command is one of gp-ground-seg, or a Python script: docs/drive.py.
+A command is one of gp-ground-seg, or a Python script: docs/faults.py.
 
 Rows and columns without a number are left out: - is none, and 0 is none beside it. A page has one
 line on the machine, below its last tables; above each figure is its commit.
@@ -153,20 +153,18 @@ def trimmed(table: str, dropped: Sequence[str] = (), wanted: str = '') -> str:
 
 def body_of(figure: Figure, output: str, commit: str, *, is_last: bool = True) -> str:
     """Write what stands between the comments; the last tables of a page say the machine."""
-    is_script = figure.command.partition(' ')[0].endswith('.py')
-    shown = f'`{"python" if is_script else "gp-ground-seg"} {figure.command}`'
     if 'picture' in figure.options:
         # The image, with the words it had, and the line that names the file.
         made = figure.options['picture'].partition(' -> ')[0]
         (image,) = re.findall(r'^!\[.*\)$', figure.body, re.MULTILINE)
         (said,) = [line for line in output.splitlines() if made in line]
-        return f'{image}\n\n{shown}\n({caption(said, made)}; commit {commit})\n'
+        return f'{image}\n\n({caption(said, made)})\n<!-- commit {commit} -->\n'
     output = kept(figure, output)
     if '| ---' not in output:
         output = f'```text\n{output}\n```'
     if not is_last:
         output = output.partition(f'\n\n{MACHINE}')[0]
-    return f'{shown} (commit {commit})\n\n{output}\n\n'
+    return f'`gp-ground-seg {figure.command}` (commit {commit})\n\n{output}\n\n'
 
 
 def read_samples() -> dict[str, list[str]]:

@@ -73,6 +73,13 @@ GAINS = {'all': 'IoU, vegetation left out', '40-50 m': 'IoU at 40 to 50 m'}
 """Rows of the IoU, by horizontal range."""
 
 
+def judged(ours: str, peer: str) -> str:
+    """Difference of two errors, with what it means where ours is the larger."""
+    n_digits = len(ours.partition('.')[2])
+    difference = f'{float(ours) - float(peer):+.{n_digits}f}'
+    return f'{difference}: worse' if float(ours) > float(peer) else difference
+
+
 def to_scores_table() -> str:
     """Write a table of the scores of docs/accuracy.md and the times of docs/performance.md."""
     page = 'docs/accuracy.md'
@@ -84,13 +91,15 @@ def to_scores_table() -> str:
         rows.append([title, f'{row["IoU"]} %', f'{row["peer IoU"]} %', gain])
     classes = rows_below(page, 'Objects: ')
     row = classes['vehicle']
-    rows.append([f'vehicles lost, of {row["objects"]}', row['lost'], row['peer lost'], ''])
-    row = rows_below(page, 'Low things and false cells')['all']
-    title = f'low objects: called ground, of {row["low returns"]}'
-    rows.append([title, f'{row["as ground"]} %', f'{row["peer as ground"]} %', ''])
-    row = classes['vegetation']
-    title = f'vegetation from 0.3 m: called ground, of {row["returns"]}'
-    rows.append([title, f'{row["as ground"]} %', f'{row["peer as ground"]} %', ''])
+    lost = row['lost'], row['peer lost']
+    rows.append([f'vehicles lost, of {row["objects"]}', *lost, judged(*lost)])
+    low = rows_below(page, 'Low things and false cells')['all']
+    for title, row in {
+        f'low objects: called ground, of {low["low returns"]}': low,
+        f'vegetation: called ground, of {classes["vegetation"]["returns"]}': classes['vegetation'],
+    }.items():
+        shares = row['as ground'], row['peer as ground']
+        rows.append([title, *(f'{share} %' for share in shares), judged(*shares)])
     times = rows_below('docs/performance.md', 'Time per frame')
     ours, peer = times['learning'], times['Patchwork++']
     title, ratio = 'time per frame, median', f'{ours["/ Patchwork++"]} times'

@@ -19,6 +19,7 @@ LOW, HIGH = 0.15, 1.5
 """Heights that a robot can hit [m]."""
 CELL, REACH = 0.1, 20.0
 """Size of the cells, and how far away they are marked [m]."""
+SCALE = 5.0  # length of the bar [m]
 SEED = 1
 SIDE = 4.2
 """Width of a map [inch]."""
@@ -40,6 +41,10 @@ def draw(figure: Any, left: float, title: str, layers: dict[str, BoolArray]) -> 
     for name, layer in layers.items():
         places = (np.argwhere(layer) + 0.5) * CELL - REACH
         axes.scatter(*places.T, s=0.8, linewidths=0.0, c=COLOURS[name])
+    axes.plot(0.0, 0.0, '>', markersize=9, color='black')
+    axes.text(0.0, -1.4, 'robot', ha='center', va='top', fontsize=9)
+    axes.plot([-REACH, SCALE - REACH], [-REACH, -REACH], color='black', lw=2.0)
+    axes.text(0.5 * SCALE - REACH, 0.6 - REACH, f'{SCALE:g} m', ha='center', fontsize=9)
     axes.set_axis_off()
     axes.set_aspect('equal')
     place = (left + 0.5 * SIDE) / width, 1.0 - 0.15 / height

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from gp_ground_seg.core.segmenter import GroundSegmenter
     from gp_ground_seg.data import semantic_kitti
 
-__version__ = '0.4.0'
+__version__ = '0.5.0'
 
 __all__ = [
     'Config',

@@ -3,6 +3,7 @@
 ros2 launch gp_ground_seg ground_segmentation.launch.py topic:=/velodyne_points rviz:=true
 """
 
+import re
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
@@ -14,8 +15,7 @@ from launch_ros.actions import Node
 
 CONFIG = Path(get_package_share_directory('gp_ground_seg')) / 'config'
 NODE = 'ground_segmentation_node'
-OUTPUTS = ('ground', 'obstacles')
-OPTIONAL = ('labeled', 'ground_model', 'scan', 'occupancy')
+RVIZ = CONFIG / 'ground_segmentation.rviz'
 
 ARGUMENTS = (
     ('topic', 'points', 'PointCloud2 topic of the LiDAR'),
@@ -38,12 +38,12 @@ def generate_launch_description():
         DeclareLaunchArgument(name, default_value=value, description=description)
         for name, value, description in ARGUMENTS
     ]
-    topics = [*OUTPUTS, *(f'{NODE}/{name}' for name in OPTIONAL)]
+    topics = dict.fromkeys(re.findall(r'Value: /(\w+\S*)', RVIZ.read_text(encoding='utf-8')))
     # First: where it is not installed, launch stops here, and leaves no node behind.
     rviz = Node(
         package='rviz2',
         executable='rviz2',
-        arguments=['-d', str(CONFIG / 'ground_segmentation.rviz'), '-f', given['frame']],
+        arguments=['-d', str(RVIZ), '-f', given['frame']],
         # A relative name is one in the namespace.
         remappings=[(f'/{topic}', topic) for topic in topics],
         condition=IfCondition(given['rviz']),

@@ -1,12 +1,14 @@
 """Run pip install, and say how much of its download is done and how long the rest may take.
 
-``python scripts/install_with_progress.py MB WHAT...``: MB is about what is downloaded in all.
+``python scripts/install_with_progress.py MB WHAT...``: MB is about what is downloaded in all. At
+the end it says what was downloaded, and how large the environment is.
 """
 
 import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 PERIOD = 5.0
 """Time between two lines [s]."""
@@ -35,6 +37,12 @@ def main(total: float, what: list[str]) -> int:
                 print(f'  {done:.0f} of {total:.0f} MB, {seconds:.0f} s left', flush=True)
                 said = now
             done += float(size[1]) * MEGABYTES.get(size[2], 1e-6)
+    # Hard links of a cache count once, as in du.
+    files = {
+        (s.st_dev, s.st_ino): s.st_blocks for s in map(Path.lstat, Path(sys.prefix).rglob('*'))
+    }
+    size = 512e-6 * sum(files.values())
+    print(f'  {done:.0f} MB downloaded, {size:.0f} MB in {Path(sys.prefix).name}', flush=True)
     return pip.returncode
 
 

@@ -17,12 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from gp_ground_seg.cli.bags import scan_cloud
-from gp_ground_seg.cli.demo import FRAME_ID, simulated_drive
+from gp_ground_seg.cli.demo import FRAME_ID, PERIOD, SPEED
 from gp_ground_seg.cli.options import progress
 from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_stamp
 from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab.scoring.report import describe_environment, machine_line
+from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 from gp_ground_seg.ros.node_process import INPUT, OUTPUTS, Link, NodeProcess, private_session
 
 SILENCE = 2.0
@@ -158,7 +159,9 @@ def main():
     if given.data:
         scans = read_scans(Path(given.data), given.clouds, given.topic)
     else:
-        scans = [points for points, _, _ in simulated_drive(N_SIMULATED)]
+        scene, rng = SCENES['urban'](0), np.random.default_rng(0)
+        places = SPEED * PERIOD * np.arange(N_SIMULATED)
+        scans = [simulate_scan(scene, HDL_64E, rng, x=x).points for x in places]
     clouds = [scan_cloud(points, 0, FRAME_ID) for points in scans]
     rates = measure(clouds, given.rates, given.frames, ros_args)
     n_points = sum(map(len, scans)) / len(scans)

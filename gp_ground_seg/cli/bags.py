@@ -61,7 +61,7 @@ use `ros2 bag play`.
 PLAY_EXAMPLES = """\
   gp-ground-seg play drive.mcap
   gp-ground-seg play drive.mcap --clock --rate 0.5
-  gp-ground-seg play drive.mcap --loop --ros-args -r /kitti/velo/pointcloud:=/points
+  gp-ground-seg play drive.mcap --loop --ros-args -r /points:=/front/points
 """
 
 

@@ -12,10 +12,10 @@ from gp_ground_seg.core.parameters.schema import FORM_OF_ROS, is_ours, nodes_of,
 from gp_ground_seg.ros.arguments import objections_of_ros
 
 EXAMPLES = """\
-  gp-ground-seg config dump > my.yaml            every parameter, explained, with its default
+  gp-ground-seg config dump > my.yaml        every parameter, explained
   gp-ground-seg config dump --config my.yaml --set label.ground_tolerance=0.15
-  gp-ground-seg config dump --preset paper       those of the paper, with the reasons
-  gp-ground-seg config check my.yaml             unknown names, types, ranges
+  gp-ground-seg config dump --preset paper   those of the paper, with reasons
+  gp-ground-seg config check my.yaml         unknown names, types, ranges
 """
 DUMP = 'print the effective parameters as a ROS parameter file'
 CHECK = 'say everything that is wrong with a parameter file'

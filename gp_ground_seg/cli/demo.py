@@ -6,11 +6,9 @@ import argparse
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.bags import scan_cloud
@@ -69,19 +67,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         options.FORCE,
     )  # fmt: skip
     parser.set_defaults(run=run)
-
-
-def simulated_drive(
-    n_frames: int,
-) -> Iterator[tuple[npt.NDArray[np.float32], npt.NDArray[np.integer], float]]:
-    """Yield the scans of a drive along a street that an HDL-64E sees.
-
-    Points (N, 4), SemanticKITTI class of each (N,), time since the start [s].
-    """
-    scene, rng = SCENES['urban'](SEED), np.random.default_rng(SEED)
-    for k in range(n_frames):
-        scan = simulate_scan(scene, HDL_64E, rng, x=SPEED * k * PERIOD)
-        yield scan.points, semantic_kitti_labels(scan.kind), k * PERIOD
 
 
 class Tally:
@@ -162,9 +147,12 @@ def _write(n_frames: int, path: Path, session: Session) -> None:
     print(f'[1/3] writing {scans} as a bag; meanwhile the node starts', flush=True)
     with options.progress('scans')(total=n_frames) as bar, BagWriter(path, force=True) as bag:
         bag.add_topic(TOPIC)
-        for points, semantic, seconds in simulated_drive(n_frames):
-            stamp = EPOCH * 10**9 + round(seconds * 1e9)
-            cloud = scan_cloud(points, stamp, FRAME_ID, label=semantic.astype(np.uint32))
+        scene, rng = SCENES['urban'](SEED), np.random.default_rng(SEED)
+        for k in range(n_frames):
+            scan = simulate_scan(scene, HDL_64E, rng, x=SPEED * k * PERIOD)
+            stamp = EPOCH * 10**9 + round(k * PERIOD * 1e9)
+            label = semantic_kitti_labels(scan.kind).astype(np.uint32)
+            cloud = scan_cloud(scan.points, stamp, FRAME_ID, label=label)
             bag.write(TOPIC, stamp, encode_cloud(cloud))
             session.check()
             bar.update()

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import ConfigError, DataError, require, shown
@@ -18,8 +18,8 @@ from gp_ground_seg.core.parameters.schema import yaml_scalar
 from gp_ground_seg.data.files import staged_file
 from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame, is_root, labelled_frames
-from gp_ground_seg.lab import experiments
 from gp_ground_seg.lab.cluster import Runner
+from gp_ground_seg.lab.experiments import EXPERIMENTS, simulated_frames
 from gp_ground_seg.lab.scoring import tables
 from gp_ground_seg.lab.scoring.evaluate import (
     KnownScan,
@@ -37,7 +37,7 @@ from gp_ground_seg.lab.scoring.report import (
     describe_environment,
     machine_line,
 )
-from gp_ground_seg.lab.simulation import DRIVES, LOW, SCENES, SENSORS, STEEP
+from gp_ground_seg.lab.simulation import SCENES, SENSORS
 
 DESCRIPTION = """\
 Segment labelled frames and score the labels in the GroundGrid convention, which leaves
@@ -60,18 +60,18 @@ EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08 --json scores.json
   gp-ground-seg evaluate KITTI_ROOT --config my.yaml --against default
   gp-ground-seg evaluate KITTI_ROOT --set faces.max_normal_z=0 --against default
-  gp-ground-seg evaluate drive.mcap --config my.yaml --against default      no labels
+  gp-ground-seg evaluate drive.mcap --config my.yaml --against default
   gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
   gp-ground-seg evaluate KITTI_ROOT --workers 8
 
-KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI). With --workers
-the scores are the same; the times are not, because frames are computed at the same time.
+KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label}. With --workers
+scores are the same; times are not: frames are computed at the same time.
 """
 
 EXPERIMENT_EXAMPLES = """\
   gp-ground-seg experiment ablation KITTI_ROOT
   gp-ground-seg experiment scenes --sensors vlp-16 --scenes kerb
-  gp-ground-seg experiment NAME --help          describes one of them
+  gp-ground-seg experiment NAME --help   describes one of them
 """
 
 PEER = 'pypatchworkpp'
@@ -87,37 +87,6 @@ CUT = (
     '0 = no low things: each method segments a frame once',
     {'metavar': 'HEIGHT', 'type': partial(options.above_zero, or_zero=True)},
 )
-THREE = ('hdl-64e', 'vlp-16', 'os1-128')
-
-
-class Experiment(NamedTuple):
-    """A function from scans, parameters and a runner to tables; its docstring is the help.
-
-    With `sensors` it simulates scans, by default of these and in these scenes.
-    """
-
-    run: Callable[..., Report]
-    sensors: Sequence[str] = ()
-    scenes: Sequence[str] = ()
-    n_seeds: int = 0  # scenes of each kind
-    places: Sequence[float] = ()  # of the sensor in each scene [m]
-    labelled: bool = True  # whether it takes labelled frames
-    is_timed: bool = False  # then it runs in one process
-
-
-EXPERIMENTS = {
-    'ablation': Experiment(
-        experiments.compare_models, THREE[:1], ['road_then_rubble'], 10, (0.0, 6.0, 12.0)
-    ),
-    'steps': Experiment(experiments.compare_steps),
-    'pseudo-inputs': Experiment(experiments.compare_pseudo_inputs, is_timed=True),
-    'scenes': Experiment(
-        experiments.score_scenes, THREE, (*DRIVES, *LOW, *STEEP), 3, (0.0, 6.0), labelled=False
-    ),
-    'table1': Experiment(experiments.table1, is_timed=True),
-    'speed': Experiment(experiments.measure_speed, is_timed=True),
-}
-"""Experiments by name. A new one is a row here and its function."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -159,7 +128,7 @@ def _add_experiments(subparsers: argparse._SubParsersAction[argparse.ArgumentPar
                 ('--sensors', SENSORS, experiment.sensors),
                 ('--scenes', SCENES, experiment.scenes),
             ):
-                text = f'some of {",".join(known)} (default: {",".join(default)})'
+                text = f'some of {", ".join(known)} (default: {", ".join(default)})'
                 kind = {'metavar': 'LIST', 'type': options.some_of(known)}
                 options.add(child, (option, text, kind))
         options.add(child, options.MARKDOWN, options.TO_JSON, options.FORCE)
@@ -210,7 +179,7 @@ def run_experiment(arguments: argparse.Namespace) -> int:
     options.refuse(arguments, others, f'is for {kind} scans')
 
     scans: Sequence[Any] = (
-        experiments.simulated_frames(
+        simulated_frames(
             arguments.sensors or experiment.sensors,
             arguments.scenes or experiment.scenes,
             arguments.seeds or experiment.n_seeds,

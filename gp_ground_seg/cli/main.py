@@ -45,9 +45,9 @@ EXAMPLES = """\
 `gp-ground-seg COMMAND --help` explains a command.
 
 examples:
-  gp-ground-seg demo                             show the node at work, no data needed
-  gp-ground-seg segment drive.mcap -o out.mcap   ground and obstacle clouds of a bag
-  gp-ground-seg evaluate KITTI_ROOT --sequences 00,08
+  gp-ground-seg plot scan scan.pcd -o scan.png   a picture of your own scan
+  gp-ground-seg demo                             the node at work, without data
+  gp-ground-seg segment drive.mcap -o out.mcap   two clouds for each of a bag
   gp-ground-seg node --ros-args -r points:=/kitti/velo/pointcloud
 """
 

@@ -13,7 +13,7 @@ from gp_ground_seg.ros.node_process import run_node
 NODE_EXAMPLES = """\
   gp-ground-seg node
   gp-ground-seg node --ros-args -r points:=/kitti/velo/pointcloud
-  gp-ground-seg node --ros-args -p label.ground_tolerance:=0.15 --params-file my.yaml
+  gp-ground-seg node --ros-args --params-file my.yaml -p sensor.height:=1.2
 """
 WARM_UP_DESCRIPTION = """\
 Compile what the node would compile at its first start, for a robot or an image of one. The

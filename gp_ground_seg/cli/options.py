@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+import textwrap
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, suppress
 from functools import partial
@@ -22,7 +23,9 @@ from gp_ground_seg.lab.cluster import Runner, open_runner
 
 DEFAULT_PRESET = 'default'
 COMPILING_PAYS = 300  # scans
+WIDTH = 79  # of the texts of help
 LINE_PERIOD = 30.0  # time between lines of progress where there is no terminal [s]
+BAR = '{desc} |{bar}| {n_fmt} of {total_fmt} frames done, {remaining} left'
 FLAG = {'action': 'store_true'}
 FORCE = ('--force', 'replace existing output', FLAG)
 MARKDOWN = ('--markdown', 'print the tables as Markdown', FLAG)
@@ -37,11 +40,12 @@ def new_parser(
     examples: str,
     purpose: str = '',
 ) -> argparse.ArgumentParser:
-    """Return the parser of a command; its texts keep their line breaks."""
+    """Return the parser of a command; paragraphs are filled, examples keep their line breaks."""
+    paragraphs = (textwrap.fill(part, WIDTH) for part in description.split('\n\n'))
     return subparsers.add_parser(
         name,
         help=purpose,
-        description=description,
+        description='\n\n'.join(paragraphs),
         epilog=f'examples:\n{examples}',
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -197,7 +201,7 @@ def count(number: int, noun: str) -> str:
 
 def progress(title: str, *, quiet: bool = False) -> partial[tqdm[Any]]:
     """Progress of items, or of a `total`, on standard error; in a file every half minute."""
-    own = {'desc': title, 'unit': 'frame', 'file': sys.stderr, 'disable': quiet, 'leave': False}
+    own = {'desc': title, 'file': sys.stderr, 'disable': quiet, 'leave': False, 'bar_format': BAR}
     if not sys.stderr.isatty():
         own |= dict.fromkeys(('mininterval', 'maxinterval', 'delay'), LINE_PERIOD)
     return partial(tqdm, **own)

@@ -10,7 +10,7 @@ from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.semantic_kitti import read_entries
-from gp_ground_seg.lab.plotting import CAMERA, Place, camera_at, plot_scan_view, plot_segment
+from gp_ground_seg.lab import plotting
 from gp_ground_seg.lab.scoring.metrics import true_labels
 
 SCAN = """\
@@ -20,7 +20,7 @@ false ground purple.
 SCAN_EXAMPLES = """\
   gp-ground-seg plot scan drive.mcap --frame 20 -o scan.png
   gp-ground-seg plot scan 000000.bin --camera 90,30,40 -o from_the_left.svg
-  gp-ground-seg plot scan velodyne/000000.bin --labels labels/000000.label -o errors.png
+  gp-ground-seg plot scan 000000.bin --labels 000000.label -o errors.png
 """
 SEGMENT = """\
 The paper's Figure 1 for any scan and segment, or two side by side: points, ground
@@ -45,9 +45,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     pictures = parser.add_subparsers(metavar='PICTURE', required=True, dest='picture')
     scan = options.new_parser(pictures, 'scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective')
     scan.add_argument(
-        '--camera', metavar='AZIMUTH,ELEVATION,DISTANCE', type=camera, default=CAMERA,
+        '--camera', metavar='AZIMUTH,ELEVATION,DISTANCE', type=camera,
         help='where it stands, seen from the middle of the scene: counter-clockwise from ahead '
-        'within 360 deg, upwards within 89 deg, 1 to 1000 m away (default: 196,24,32)',
+        'within 360 deg, upwards within 89 deg, 1 to 1000 m away (default: 196,24 and as near '
+        'as the cloud is small)',
     )  # fmt: skip
     segment = options.new_parser(
         pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, 'a segment from the side'
@@ -88,9 +89,13 @@ def run(arguments: argparse.Namespace) -> int:
     used = options.spare_compiling(config, 1)
     result = GroundSegmenter(used).segment(points)
     if arguments.picture == 'scan':
-        said = plot_scan_view(points, result.label, path, title, arguments.camera, truth=truth)
+        view = points, result.label, path, title, arguments.camera
+        said = plotting.plot_scan_view(*view, truth=truth)
     else:
-        said = plot_segment(result, config, points, arguments.segment, path, truth, title)
+        said = plotting.plot_segment(result, points, arguments.segment, path, truth, title)
+    for line in result.pose.contradictions:
+        options.note(line)
+    print(f'sensor: {plotting.words_of_pose(result.pose)}')
     print(f'{said}, written to {shown(path)}')
     options.note_spared(config, used)
     return 0
@@ -101,9 +106,9 @@ def numbers(text: str) -> list[int]:
     return [int(word) for word in text.split(',')]
 
 
-def camera(text: str) -> Place:
+def camera(text: str) -> plotting.Place:
     """Read azimuth, elevation and distance; straight from above no side of a picture is up."""
     azimuth, elevation, distance = map(float, text.split(','))
     if not (abs(azimuth) <= 360.0 and abs(elevation) <= 89.0 and 1.0 <= distance <= 1000.0):
         raise ValueError
-    return camera_at(azimuth, elevation, distance)
+    return plotting.camera_at(azimuth, elevation, distance)

@@ -51,7 +51,7 @@ EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label
   gp-ground-seg segment KITTI_ROOT/sequences/00 -o labels
   gp-ground-seg segment scan.pcd -o scan.npz
-  gp-ground-seg segment drive.mcap                          writes drive_ground.mcap
+  gp-ground-seg segment drive.mcap             writes drive_ground.mcap
   gp-ground-seg segment KITTI_ROOT -o OUT --workers 8
   gp-ground-seg segment KITTI_ROOT -o OUT --scheduler tcp://host:8786
 """

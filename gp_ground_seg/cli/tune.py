@@ -21,7 +21,7 @@ into a running node. The page is served to this machine only. Ctrl-C stops it.
 EXAMPLES = """\
   gp-ground-seg tune 000000.bin
   gp-ground-seg tune KITTI_ROOT/sequences/00 --frame 5 -o kitti.yaml
-  gp-ground-seg tune drive.mcap --parameters label.ground_tolerance,faces.cell_size
+  gp-ground-seg tune drive.mcap --parameters sensor.height,faces.cell_size
 
 needs the package viser (docs/install.md)
 """

@@ -122,14 +122,14 @@ class Tiles(NamedTuple):
 class Candidates(NamedTuple):
     """Ground candidates PG_m of all segments, near to far in each."""
 
-    r: FloatArray  # (C,) horizontal range of the lowest point of each occupied bin [m]
-    z: FloatArray  # (C,) its height [m]
-    bin: IntArray  # (C,) bin of each candidate
-    density: FloatArray  # (C,) vertical density of each candidate's bin [points/m^2]
-    offsets: IntArray  # (M + 1,) candidates of segment m are ``offsets[m]:offsets[m + 1]``
-    tile: CellArray  # (C,) tile of each candidate
-    x: FloatArray  # (C,) place of each candidate [m]
-    y: FloatArray  # (C,) the same [m]
+    r: FloatArray  #: (C,) horizontal range of the lowest point of each occupied bin [m]
+    z: FloatArray  #: (C,) its height [m]
+    bin: IntArray  #: (C,) bin of each candidate
+    density: FloatArray  #: (C,) vertical density of each candidate's bin [points/m^2]
+    offsets: IntArray  #: (M + 1,) candidates of segment m are ``offsets[m]:offsets[m + 1]``
+    tile: CellArray  #: (C,) tile of each candidate
+    x: FloatArray  #: (C,) place of each candidate [m]
+    y: FloatArray  #: (C,) the same [m]
 
     @property
     def segment(self) -> IntArray:
@@ -209,11 +209,11 @@ class Lines(NamedTuple):
 class PseudoInputs(NamedTuple):
     """Pseudo-inputs of the latent process."""
 
-    r_bar: FloatArray  # (P,) ranges [m], increasing in each segment
-    log_extent: FloatArray  # (P,) log extent of the line of each, first guess of L-bar [log m]
-    offsets: IntArray  # (M + 1,) pseudo-inputs of segment m are ``offsets[m]:offsets[m + 1]``
-    line: IntArray  # (P,) number of the line that each is on
-    # (P,) class of the line of each; those of a class share an entry of L-bar, ``theta[5 + kind]``
+    r_bar: FloatArray  #: (P,) ranges [m], increasing in each segment
+    log_extent: FloatArray  #: (P,) log extent of the line of each, first guess of L-bar [log m]
+    offsets: IntArray  #: (M + 1,) pseudo-inputs of segment m are ``offsets[m]:offsets[m + 1]``
+    line: IntArray  #: (P,) number of the line that each is on
+    #: (P,) class of the line of each; those of a class share an entry of L-bar, ``theta[5 + k]``
     kind: IntArray
 
 
@@ -247,12 +247,12 @@ class Inliers(NamedTuple):
 class GroundSurface(NamedTuple):
     """Ground height over range in every segment."""
 
-    knots: FloatArray  # (K,) ranges [m]: the bin edges
-    # (M, K) ground height in the level frame [m]; NaN in segments without a model, and behind the
-    # last bin with a return in a segment
+    knots: FloatArray  #: (K,) ranges [m]: the bin edges
+    #: (M, K) height of the ground over the relief [m]; NaN in segments without a model, behind the
+    #: last bin with a return in a segment
     mean: FloatArray
-    std: FloatArray  # (M, K) its standard deviation [m]; NaN in the same places
-    inlier: BoolArray  # (C,) candidates that the surface rests on
+    std: FloatArray  #: (M, K) its standard deviation [m]; NaN in the same places
+    inlier: BoolArray  #: (C,) candidates that the surface rests on
 
 
 def at_points(knots: FloatArray, table: FloatArray, grid: PolarGrid) -> PointArray:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import in_thousands
+from gp_ground_seg.core.errors import ConfigError, in_thousands
 from gp_ground_seg.core.frame import (
     BoolArray,
     Candidates,
@@ -26,7 +26,9 @@ from gp_ground_seg.core.frame import (
     at_points,
     usual_errors,
 )
+from gp_ground_seg.core.gp.ground import posterior_covariance
 from gp_ground_seg.core.gp.learning import Learned, theta_names
+from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.labels import ground_probability
 from gp_ground_seg.core.pipeline.relief import Relief
 from gp_ground_seg.core.pipeline.residuals import CorrectedSurface, correct_surface
@@ -108,6 +110,25 @@ class FitReport:
         )
 
 
+class Segment(NamedTuple):
+    """One segment of a scan: what the processes of the paper observe, and what they predict.
+
+    Ranges are horizontal distances from the sensor; heights are over it, along the vertical, which
+    is the sensor's z axis where ``pose`` has no tilt.
+    """
+
+    r: FloatArray  #: (C,) horizontal range of each ground candidate [m]
+    z: FloatArray  #: (C,) its height [m]
+    inlier: BoolArray  #: (C,) whether the surface rests on it
+    pseudo_r: FloatArray  #: (P,) range of each pseudo-input [m]; none without a latent process
+    pseudo_l: FloatArray  #: (P,) its length-scale, L-bar [m]
+    knots: FloatArray  #: (K,) ranges at which the ground is predicted [m]; none without a model
+    mean: FloatArray  #: (K,) height of the ground there [m]
+    std: FloatArray  #: (K,) its standard deviation [m]
+    cov: FloatArray  #: (K, K) posterior covariance of these heights; its diagonal is ``std**2``
+    length_scale: FloatArray  #: (K,) length-scale of the kernel there [m]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Segmentation:
     """A segmented scan; per-point arrays are in input order.
@@ -128,8 +149,8 @@ class Segmentation:
     grid, frame, surface
         Intermediate results, for plots and diagnostics; in the level frame. `surface` is the
         process's own, which the labels follow from; `corrected` is what users are given.
-    log_length_scale : (M, knots) float64
-        Log length-scale at the knots of the surface [log m]; NaN in segments
+    log_length_scale : (M, K) float64
+        Log length-scale at the K knots of the surface [log m]; NaN in segments
         without candidates.
     pose : SensorPose
         Height and tilt of the sensor that were used, and what the scan says of them;
@@ -138,8 +159,8 @@ class Segmentation:
         Height of the land in plan, over which the heights of `frame` and `surface` are.
     z : (N,) float32 or float64
         Height of each point in the sensor frame [m].
-    slope_std : float
-        ``observation.slope_std`` of the frame.
+    config : Config
+        Parameters of the frame: those given, with narrower gates for a low sensor.
     """
 
     labelled: Labelled
@@ -153,7 +174,7 @@ class Segmentation:
     pose: SensorPose
     relief: Relief
     z: PointArray
-    slope_std: float
+    config: Config
 
     @property
     def theta(self) -> FloatArray:
@@ -219,6 +240,34 @@ class Segmentation:
         is_lost = np.count_nonzero(self.is_ground) < LEAST_GROUND * n_finite
         return (*self.pose.warnings, *((NO_GROUND,) if is_lost else ()))
 
+    def segment(self, m: int) -> Segment:
+        """Candidates, pseudo-inputs and ground of segment `m`, counter-clockwise from -x.
+
+        The surface is the process's own, that of the labels; `corrected` is without the bias of
+        lowest points. Raises a ConfigError if there is no such segment.
+        """
+        n_segments = self.grid.n_segments
+        if not 0 <= m < n_segments:
+            raise ConfigError(f'segment {m}: must be in [0, {n_segments - 1}]')
+        surface, own = self.surface, self.candidates.segment == m
+        known = np.isfinite(surface.mean[m])
+        knots, candidates = surface.knots[known], self.candidates.where(own)
+        is_latent = self.config.length_scale.model == 'latent'
+        bar = slice(*self.pseudo.offsets[m : m + 2]) if is_latent else slice(0)
+        l_bar = self.pseudo.log_extent[bar] + self.theta[5 + self.pseudo.kind[bar]]
+        return Segment(
+            candidates.r,
+            candidates.z + self.relief.at(candidates.x, candidates.y),
+            surface.inlier[own],
+            self.pseudo.r_bar[bar],
+            np.exp(l_bar),
+            knots,
+            surface.mean[m, known] + self.relief.at_knots(knots, n_segments)[m],
+            surface.std[m, known],
+            posterior_covariance(self.frame, self.theta, self.config, surface, m),
+            np.exp(self.log_length_scale[m, known]),
+        )
+
     # What follows is computed when it is first asked for: not every user asks.
 
     @cached_property
@@ -233,8 +282,8 @@ class Segmentation:
         See `gp_ground_seg.core.pipeline.residuals.correct_surface`. The relief is that in the
         middle of each segment.
         """
-        noise_std, labelled = float(np.exp(self.theta[1])), self.labelled
-        found = correct_surface(self.surface, labelled, self.grid, noise_std, self.slope_std)
+        noise_std, slope_std = float(np.exp(self.theta[1])), self.config.observation.slope_std
+        found = correct_surface(self.surface, self.labelled, self.grid, noise_std, slope_std)
         relief = self.relief.at_knots(found.knots, self.grid.n_segments)
         return found._replace(mean=found.mean + relief)
 

@@ -199,7 +199,7 @@ class GroundSegmenter:
             pose=pose,
             relief=relief,
             z=xyz[:, 2].copy(),
-            slope_std=config.observation.slope_std,
+            config=config,
         )
 
     @property

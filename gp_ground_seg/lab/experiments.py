@@ -7,7 +7,7 @@ given; scans are labelled frames, or simulated, with exact labels and heights.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -46,6 +46,7 @@ from gp_ground_seg.lab.scoring.tables import (
 )
 from gp_ground_seg.lab.simulation import LOW, PLACES, SCENES, SENSORS, STEEP, Kind, simulate_scan
 from gp_ground_seg.lab.simulation.objects import object_heights
+from gp_ground_seg.lab.simulation.scenes import DRIVES
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -503,3 +504,34 @@ def _smse(truth: FloatArray, estimate: FloatArray) -> float:
     known = np.isfinite(estimate)
     truth, estimate = truth[known], estimate[known]
     return float(np.mean((estimate - truth) ** 2) / np.var(truth))
+
+
+THREE = ('hdl-64e', 'vlp-16', 'os1-128')
+
+
+class Experiment(NamedTuple):
+    """A function from scans, parameters and a runner to tables; its docstring is the help.
+
+    With `sensors` it simulates scans, by default of these and in these scenes.
+    """
+
+    run: Callable[..., Report]
+    sensors: Sequence[str] = ()
+    scenes: Sequence[str] = ()
+    n_seeds: int = 0  # scenes of each kind
+    places: Sequence[float] = ()  # of the sensor in each scene [m]
+    labelled: bool = True  # whether it takes labelled frames
+    is_timed: bool = False  # then it runs in one process
+
+
+EXPERIMENTS = {
+    'ablation': Experiment(compare_models, THREE[:1], ['road_then_rubble'], 10, (0.0, 6.0, 12.0)),
+    'steps': Experiment(compare_steps),
+    'pseudo-inputs': Experiment(compare_pseudo_inputs, is_timed=True),
+    'scenes': Experiment(
+        score_scenes, THREE, (*DRIVES, *LOW, *STEEP), 3, (0.0, 6.0), labelled=False
+    ),
+    'table1': Experiment(table1, is_timed=True),
+    'speed': Experiment(measure_speed, is_timed=True),
+}
+"""Experiments by name: a new one is its function and a row here."""

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import ConfigError, in_thousands, require
+from gp_ground_seg.core.errors import in_thousands, require
 from gp_ground_seg.core.frame import OUTSIDE, BoolArray, FloatArray, Label
-from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.points import take_points
+from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.files import staged_file, writing
 from gp_ground_seg.lab.scoring.metrics import Labels, count_labels, label_ratios
@@ -57,6 +57,8 @@ CLOSEST = 1.0
 CAMERA, TARGET = (-16.0, -7.0, 10.0), (12.0, 1.0, -3.0)
 ZOOM = 0.75
 """Focal length over the width of the picture."""
+REACH = 25.0
+"""Range within which nine tenths of the points of a street are [m]: the camera suits these."""
 
 Place = tuple[float, float, float]
 Layers = dict[str, BoolArray]
@@ -68,39 +70,55 @@ def plot_scan_view(
     label: Labels,
     path: str | Path,
     title: str = '',
-    camera: Place = CAMERA,
+    camera: Place | None = None,
     *,
     truth: Labels | None = None,
 ) -> str:
     """Draw a scan in perspective, replacing the file `path`; return numbers of points.
 
     Ground and obstacles of `points`, (N, >=3) [m], by their `Label`; with the true labels, UNKNOWN
-    where a point does not count, the errors too. `camera` is in the sensor frame [m]. In a PDF
-    or SVG points are pixels.
+    where a point does not count, the errors too. `camera` is in the sensor frame [m]; without one,
+    it comes as near as the cloud is small. In a PDF or SVG points are pixels.
     """
     xyz = take_points(points).astype(np.float64)
+    if camera is None:  # a cloud that is enlarged looks as from nearby
+        reach = np.hypot(*xyz[np.isfinite(xyz).all(axis=1), :2].T)
+        usual = np.quantile(np.append(reach, REACH), 0.9)
+        xyz, camera = xyz * (REACH / np.clip(usual, CLOSEST, REACH)), CAMERA
     said, layers = label_layers(label, truth)
     figure, foot = new_figure(WIDTH, HEIGHT + FOOT), FOOT / (HEIGHT + FOOT)
     axes = figure.add_axes((0.0, foot, 1.0, 1.0 - foot))
-    axes.set_axis_off()
-    axes.set_xlim(-0.5, 0.5)
-    axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
     figure.text(
         0.5, 0.96, title, ha='center', parse_math=False, fontsize=14, backgroundcolor='white'
     )
+    draw_scan(axes, xyz, layers, camera)
+    figure.legend(loc='lower left', fontsize=11, frameon=False, ncols=4)
+    save(figure, path)
+    return said
+
+
+def draw_scan(axes: Any, xyz: FloatArray, layers: Layers, camera: Place, dot: float = 1.0) -> None:
+    """Draw layers of points (N, 3) in perspective; the least area of a dot is `dot`."""
+    axes.set_axis_off()
+    axes.set_xlim(-0.5, 0.5)
+    axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
     place, depth = project(xyz, camera)
     for name, layer in layers.items():
         chosen = np.flatnonzero(layer & (depth > CLOSEST))
         chosen = chosen[np.argsort(-depth[chosen])]  # far points first
-        axes.scatter(
-            *place[chosen].T, s=np.clip(60.0 / depth[chosen], 1.0, 5.0), linewidths=0.0,
-            rasterized=True, c=COLOURS[name],
-        )  # fmt: skip
+        size = np.clip(60.0 * dot / depth[chosen], dot, 5.0 * dot)
+        look = {'linewidths': 0.0, 'rasterized': True, 'c': COLOURS[name]}
+        axes.scatter(*place[chosen].T, s=size, **look)
         # Dots as small as in the picture would show no colour in the legend.
         axes.plot([], [], 'o', markersize=7, color=COLOURS[name], label=name)
-    figure.legend(loc='lower left', fontsize=11, frameon=False, ncols=4)
-    save(figure, path)
-    return said
+
+
+def words_of_pose(pose: SensorPose) -> str:
+    """Return the height and tilt that were used, and whether they were estimated."""
+    source = 'estimated' if pose.height_estimated else 'given'
+    height = f'{pose.height:.2f} m over the ground'
+    tilt = 'level' if pose.is_level else f'roll {pose.roll:.3f}, pitch {pose.pitch:.3f} rad'
+    return f'{height} ({"assumed" if pose.is_height_default else source}), {tilt}'
 
 
 def camera_at(azimuth: float, elevation: float, distance: float) -> Place:
@@ -156,12 +174,11 @@ LINE_COLOUR, SURFACE_COLOUR, PSEUDO_INPUT_COLOUR = GREEN, '#111111', VIOLET
 
 # Metres kept free below and above the ground, and beyond the last candidate.
 BELOW, ABOVE, BEYOND = 0.4, 0.9, 2.0
-N_OF_LINE = 16  # places at which a line is drawn over the relief
+N_OF_LINE, STEEPEST = 16, 1e6  # places at which a line is drawn over the relief; slope of a wall
 
 
 def plot_segment(
     result: Segmentation,
-    config: Config,
     points: npt.ArrayLike,
     segments: Sequence[int],
     path: str | Path,
@@ -170,9 +187,9 @@ def plot_segment(
 ) -> str:
     """Draw segments from the side, side by side; below each the length-scale and pseudo-inputs.
 
-    `result` is the segmentation of `points`, (N, >=3) [m], under `config`. `truth` (N,) are true
-    labels, UNKNOWN where a point does not count. The axes end a little beyond the last candidate.
-    The file `path` is replaced. Return numbers of what is in them.
+    `result` is the segmentation of `points`, (N, >=3) [m]. `truth` (N,) are true labels, UNKNOWN
+    where a point does not count. The axes end a little beyond the last candidate. The file `path`
+    is replaced. Return numbers of what is in them.
     """
     z = result.pose.level(take_points(points).astype(np.float64))[:, 2].astype(np.float64)
     views = [SegmentView(result, segment, z) for segment in segments]
@@ -185,7 +202,7 @@ def plot_segment(
         above.set_title(name, fontsize=12, loc='left', parse_math=False)
         view.draw_points(above, truth)
         view.draw_ground(above)
-        view.draw_length_scale(below, config)
+        view.draw_length_scale(below)
         title = ''
     reach = max(view.reach() for view in views)
     lows, highs = zip(*(view.heights_shown() for view in views), strict=True)
@@ -209,46 +226,30 @@ class SegmentView:
     """
 
     def __init__(self, result: Segmentation, segment: int, z: FloatArray) -> None:
-        n_segments = result.grid.n_segments
-        if not 0 <= segment < n_segments:
-            raise ConfigError(f'segment {segment}: must be in [0, {n_segments - 1}]')
-        self._result, self._segment = result, segment
+        self._result, self._segment, self._own = result, segment, result.segment(segment)
         self._inside = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
         self.r, self.z = result.grid.r[self._inside], z[self._inside]
-        first, last = result.candidates.offsets[segment : segment + 2].tolist()
-        own = result.candidates.where(result.candidates.segment == segment)
-        self._r, self._z = own.r, own.z + result.relief.at(own.x, own.y)
-        self._inlier = result.surface.inlier[first:last]
-        self._lines = np.unique(result.lines.line[first:last])
-        self._knots = result.surface.knots
-        self._std = result.surface.std[segment]
-        self._mean = result.surface.mean[segment] + self._relief(self._knots)
 
     @property
     def name(self) -> str:
         """Number of the segment and its azimuths, and whether it has a ground model."""
         width = 360.0 / self._result.grid.n_segments
         first, last = (width * (self._segment + k) - 180.0 for k in (0, 1))
-        model = '' if np.isfinite(self._mean).any() else ': no ground model'
+        model = '' if len(self._own.knots) else ': no ground model'
         return f'segment {self._segment}, azimuth {first:g}° to {last:g}°{model}'
 
     @property
     def counts(self) -> str:
         """Numbers of candidates, inliers and pseudo-inputs."""
-        n_pseudo = np.diff(self._result.pseudo.offsets)[self._segment]
+        own = self._own
         return (
-            f'segment {self._segment}: {len(self._r)} candidates, {self._inlier.sum()} inliers, '
-            f'{n_pseudo} pseudo-inputs'
+            f'segment {self._segment}: {len(own.r)} candidates, {own.inlier.sum()} inliers, '
+            f'{len(own.pseudo_r)} pseudo-inputs'
         )
-
-    def _relief(self, r: FloatArray) -> FloatArray:
-        """Height of the relief at ranges (K,) in the middle of the segment, (K,) [m]."""
-        heights = self._result.relief.at_knots(r, self._result.grid.n_segments)
-        return np.asarray(heights[self._segment])
 
     def reach(self) -> float:
         """Return the range that holds all candidates, or if none all points [m]."""
-        r = self._r if len(self._r) else self.r
+        r = self._own.r if len(self._own.r) else self.r
         return float(r.max()) + BEYOND if len(r) else float(self._result.grid.edges[-1])
 
     def draw_points(self, axes: Any, truth: Labels | None) -> None:
@@ -260,23 +261,24 @@ class SegmentView:
 
     def draw_ground(self, axes: Any) -> None:
         """Draw ground, lines and candidates over range."""
-        low, high = self._mean - 2.0 * self._std, self._mean + 2.0 * self._std
+        own = self._own
+        low, high = own.mean - 2.0 * own.std, own.mean + 2.0 * own.std
         look = {'linewidth': 0.0, 'color': SURFACE_COLOUR, 'alpha': 0.15, 'zorder': 3}
-        axes.fill_between(self._knots, low, high, label='surface ± 2 std', **look)
+        axes.fill_between(own.knots, low, high, label='surface ± 2 std', **look)
         self._draw_lines(axes)
-        axes.plot(self._knots, self._mean, color=SURFACE_COLOUR, lw=1.8, zorder=5, label='surface')
+        axes.plot(own.knots, own.mean, color=SURFACE_COLOUR, lw=1.8, zorder=5, label='surface')
         for name, chosen, inner in (
-            ('rejected', ~self._inlier, 'white'),
-            ('inliers', self._inlier, CANDIDATE_COLOUR),
+            ('rejected', ~own.inlier, 'white'),
+            ('inliers', own.inlier, CANDIDATE_COLOUR),
         ):
             look = {'mfc': inner, 'mec': CANDIDATE_COLOUR, 'ms': 5.5, 'zorder': 7}
             label = f'candidates, {name}'
-            axes.plot(self._r[chosen], self._z[chosen], 'o', label=label, **look)
+            axes.plot(own.r[chosen], own.z[chosen], 'o', label=label, **look)
         axes.set_ylabel('height z, sensor frame [m]')
 
     def heights_shown(self) -> tuple[float, float]:
         """Limits around the inliers, or if none the lower half of the points [m]."""
-        z = self._z[self._inlier]
+        z = self._own.z[self._own.inlier]
         if not len(z):
             z = np.quantile(self.z, (0.0, 0.5)) if len(self.z) else np.array([-2.0, 0.0])
         return float(z.min()) - BELOW, float(z.max()) + ABOVE
@@ -284,46 +286,38 @@ class SegmentView:
     def _draw_lines(self, axes: Any) -> None:
         """Draw each line over its extent, and the critical points where the next one begins."""
         candidates, lines = self._result.candidates, self._result.lines
+        first, last = candidates.offsets[self._segment : self._segment + 2]
+        numbers = np.unique(lines.line[first:last])
         look = {'color': LINE_COLOUR, 'lw': 3.2, 'alpha': 0.75, 'zorder': 4, 'label': 'lines'}
-        share = np.linspace(0.0, 1.0, N_OF_LINE)
-        for q in self._lines:
+        for q in numbers:
             points = slice(lines.start[q], lines.start[q + 1])
             if points.stop - points.start > 1:
-                ends = line_ends(candidates.r[points], candidates.z[points], float(lines.slope[q]))
-                r, z = (a + share * (b - a) for a, b in ends)
-                axes.plot(r, z + self._relief(r), **look)
+                own_r, own_z = candidates.r[points], candidates.z[points]
+                r = np.linspace(own_r[0], own_r[-1], N_OF_LINE)
+                slope = np.clip(lines.slope[q], -STEEPEST, STEEPEST)
+                z = np.clip(own_z.mean() + slope * (r - own_r.mean()), own_z.min(), own_z.max())
+                relief = self._result.relief.at_knots(r, self._result.grid.n_segments)
+                axes.plot(r, z + relief[self._segment], **look)
                 look['label'] = None  # one entry in the legend for all
-        critical = lines.start[self._lines[1:]] - candidates.offsets[self._segment]
+        critical = lines.start[numbers[1:]] - first
         axes.plot(
-            self._r[critical], self._z[critical], 'd', ms=9, mfc='none', mec=LINE_COLOUR,
+            self._own.r[critical], self._own.z[critical], 'd', ms=9, mfc='none', mec=LINE_COLOUR,
             zorder=8, label='critical points',
         )  # fmt: skip
 
-    def draw_length_scale(self, axes: Any, config: Config) -> None:
+    def draw_length_scale(self, axes: Any) -> None:
         """Draw the length-scale over range, its limits, and the pseudo-inputs it follows."""
         from matplotlib.ticker import LogLocator
 
-        result = self._result
-        length_scale = np.exp(result.log_length_scale[self._segment])
-        axes.plot(self._knots, length_scale, color=SURFACE_COLOUR, lw=1.8, label='length-scale')
-        if config.length_scale.model == 'latent':
-            own = slice(*result.pseudo.offsets[self._segment : self._segment + 2])
-            shared = result.theta[5 + result.pseudo.kind[own]]
-            l_bar = np.exp(result.pseudo.log_extent[own] + shared)
+        own, limits = self._own, self._result.config.length_scale
+        axes.plot(own.knots, own.length_scale, color=SURFACE_COLOUR, lw=1.8, label='length-scale')
+        if limits.model == 'latent':
             look = {'ms': 5, 'color': PSEUDO_INPUT_COLOUR, 'mew': 0.0, 'label': 'pseudo-inputs'}
-            axes.plot(result.pseudo.r_bar[own], l_bar, 's', **look)
-        for limit in (config.length_scale.min, config.length_scale.max):
+            axes.plot(own.pseudo_r, own.pseudo_l, 's', **look)
+        for limit in (limits.min, limits.max):
             axes.axhline(limit, color=SURFACE_COLOUR, lw=0.8, ls=':')
         axes.set_yscale('log')
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter('{x:g}')
         axes.set_xlabel('horizontal range r [m]')
         axes.set_ylabel('length-scale l [m]')
-
-
-def line_ends(r: FloatArray, z: FloatArray, slope: float) -> tuple[FloatArray, FloatArray]:
-    """Return range and height, (2,) each, of the ends of a line through points (n,) [m]."""
-    angle = math.atan(slope)
-    along = (r - r.mean()) * math.cos(angle) + (z - z.mean()) * math.sin(angle)
-    ends = np.array([along.min(), along.max()])
-    return r.mean() + ends * math.cos(angle), z.mean() + ends * math.sin(angle)

@@ -36,7 +36,7 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.inputs import Input, Inputs
 from gp_ground_seg.data.semantic_kitti import read_entries
-from gp_ground_seg.lab.plotting import CAMERA, COLOURS, GREEN, TARGET
+from gp_ground_seg.lab.plotting import CAMERA, COLOURS, GREEN, TARGET, words_of_pose
 from gp_ground_seg.lab.scoring.evaluate import KnownScan, labelled_scan, score_scan
 from gp_ground_seg.lab.scoring.metrics import Labels, label_ratios
 
@@ -159,7 +159,7 @@ def _is_admitted(request: Any, token: str) -> bool:
 
 def box(content: str) -> str:
     """Return HTML `content` in the small type of viser's controls."""
-    return f'<div style="font-size:12px;padding:4px 12px">{content}</div>'
+    return f'<div style="font-size:12px;padding:4px 12px;white-space:pre-line">{content}</div>'
 
 
 def legend(names: Iterable[str]) -> str:
@@ -215,6 +215,7 @@ class Tuner:
     ) -> None:  # fmt: skip
         self._server, self._start, self._reference = server, config, config
         self._segmenter, self._changed = GroundSegmenter(config), threading.Event()
+        self._automatic: dict[str, tuple[Any, Any]] = {}  # slider and checkbox
         self._changed.set()
         self._cloud: Any = None
         self._drawn: object = None
@@ -225,7 +226,7 @@ class Tuner:
         # Sharing would send the scan through a server of viser's makers.
         gui.configure_theme(control_width='large', show_share_button=False, show_logo=False)
         gui.set_panel_label(inputs.path.name)
-        self._said = gui.add_html(box('segmenting ...'))
+        self._said = gui.add_html(box('segmenting; compiles for a minute the first time ...'))
         self._table, self._legend = gui.add_markdown(''), gui.add_html('')
         self._frame = gui.add_slider('frame', 0, max(last, 1), 1, frame, visible=last > 0)
         self._colours = gui.add_dropdown('colours', ('changes', 'class', 'errors'))
@@ -249,8 +250,8 @@ class Tuner:
             self._changed.clear()
             _tell(self._said, self._update)
 
-    def _update(self) -> None:
-        self.show(self._frame.value, self._colours.value, self.config)
+    def _update(self) -> str:
+        return self.show(self._frame.value, self._colours.value, self.config)
 
     def _compare(self, config: Config) -> None:
         self._reference = config
@@ -279,12 +280,17 @@ class Tuner:
         number = spec.type(0.5 * (low + high) if now == AUTO else now)
         title = f'{spec.name} [{spec.unit}]' if spec.unit else spec.name
         slider = gui.add_slider(title, low, high, step, number, hint=hint, disabled=now == AUTO)
-        self._watch(slider)
+        _, is_said, effect = spec.description.partition('; larger: ')
+        if is_said:
+            gui.add_html(box(f'larger: {effect}'))
         if not spec.auto:
+            self._watch(slider)
             return lambda: slider.value
-        automatic = gui.add_checkbox(f'{spec.name} = {AUTO}', now == AUTO)
+        automatic = gui.add_checkbox(AUTO, now == AUTO, hint=f'{spec.name} = {AUTO}')
         automatic.on_update(lambda _event: setattr(slider, 'disabled', automatic.value))
-        self._watch(automatic)
+        # Setting the slider to what was estimated segments once more, to the same result.
+        self._watch(slider, automatic)
+        self._automatic[spec.name] = slider, automatic
         return lambda: AUTO if automatic.value else slider.value
 
     def _segment(self, number: int, config: Config) -> tuple[Segmentation, dict[str, Any]]:
@@ -293,8 +299,8 @@ class Tuner:
         result = self._segmenter.segment(self._view(number).points)
         return result, score_scan(self._view(number), result)['scans'][0]
 
-    def show(self, number: int, name: str, config: Config) -> None:
-        """Segment a frame, and draw it in the colours of that name."""
+    def show(self, number: int, name: str, config: Config) -> str:
+        """Segment a frame, draw it in the colours of that name, and return its warnings."""
         (before, sums_before), view = self._before(number, self._reference), self._view(number)
         result, sums = self._segment(number, config)
         other = view.truth if name == 'errors' else before.label
@@ -316,6 +322,11 @@ class Tuner:
                 self._drawn = drawn
             self._legend.content = box(legend(dict.fromkeys(['class', name])))
             self._table.content = _table(result, before.label, (sums, sums_before))
+            for parameter, (slider, automatic) in self._automatic.items():
+                if automatic.value:
+                    value = round(getattr(result.pose, parameter.split('.')[1]), 3)
+                    slider.value = min(max(value, slider.min), slider.max)
+        return '\n'.join((*result.warnings, *result.pose.contradictions))
 
 
 def _tell(place: Any, action: Callable[[], str | None]) -> None:
@@ -345,5 +356,6 @@ def _table(result: Segmentation, before: Labels, sums: Sequence[dict[str, Any]])
     return '\n'.join(
         ['| | now | before |', '|---|--:|--:|',
          *(f'| {word} | {now} | {then} |' for word, (now, then) in rows.items()), '',
-         f'{n_changed} changed: {n_ground} now ground, {n_obstacle} now obstacle']
+         f'{n_changed} changed: {n_ground} now ground, {n_obstacle} now obstacle', '',
+         f'sensor: {words_of_pose(result.pose)}']
     )  # fmt: skip

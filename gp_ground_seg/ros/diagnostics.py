@@ -291,12 +291,6 @@ class Diagnostics:
             )
         self.processing.processed(time.monotonic() - arrival, backend, stages, age)
         self._newest = scan
-        logger.info(
-            f'so far: {self.summary()}',
-            skip_first=True,
-            throttle_duration_sec=LOG_PERIOD,
-            throttle_time_source_type=STEADY_CLOCK,
-        )
 
     def summary(self) -> str:
         """Return what became of the clouds so far."""
@@ -316,8 +310,15 @@ class Diagnostics:
     def _publish(self) -> None:
         array = DiagnosticArray()
         array.header.stamp = self._node.get_clock().now().to_msg()
-        node_name = self._node.get_fully_qualified_name()
-        for status in self._report():
+        node_name, statuses = self._node.get_fully_qualified_name(), self._report()
+        said = '; '.join(f'{own.task} {own.level.name}: {own.message}' for own in statuses)
+        self._node.get_logger().info(
+            f'so far: {self.summary()}; {said}',
+            skip_first=True,
+            throttle_duration_sec=LOG_PERIOD,
+            throttle_time_source_type=STEADY_CLOCK,
+        )
+        for status in statuses:
             message = DiagnosticStatus(
                 level=bytes([status.level]),
                 name=f'{node_name.lstrip("/")}: {status.task}',

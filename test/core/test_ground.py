@@ -5,7 +5,7 @@ import pytest
 import reference_gp
 from conftest import BACKENDS, fewer, hilly_scan
 
-from gp_ground_seg import Config
+from gp_ground_seg import Config, ConfigError, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.frame import Frame
 from gp_ground_seg.core.gp.learning import given_theta
@@ -104,3 +104,36 @@ def test_rounding_beside_little_noise_is_no_fault(backend):
     assert surface.inlier.all()
     rounding = {'numpy': 1e-3, 'numba': 1e-2}[backend.name]
     np.testing.assert_allclose(surface.mean[m], -1.73, atol=rounding)
+
+
+def test_a_segment_is_as_in_the_paper_in_the_frame_of_the_sensor():
+    """Heights are those of points and of the sensor; mean and covariance follow equations 6, 7."""
+    xyz = hilly_scan().astype(np.float32)
+    result = GroundSegmenter('paper', learning_mode='fixed', sensor_height=1.6).segment(xyz)
+    own, theta = result.segment(90), np.exp(result.theta)
+    lowest = np.isin(own.z.astype(np.float32), xyz[result.grid.segment == 90, 2])
+    assert lowest.all() and own.inlier.sum() > 5
+    u, knot_u = reference_gp.log_length_scales(result.frame, result.theta, result.config, 90)
+    r = np.concatenate([own.r[own.inlier], own.knots])
+    l = np.exp(np.concatenate([u[own.inlier], knot_u]))  # noqa: E741
+    prior, n = reference_gp.paciorek(r, l, r, l, theta[0]), own.inlier.sum()
+    gain = prior[n:, :n] @ np.linalg.inv(prior[:n, :n] + theta[1] ** 2 * np.eye(n))
+    np.testing.assert_allclose(own.mean, gain @ (own.z[own.inlier] + 1.6) - 1.6, atol=1e-4)
+    np.testing.assert_allclose(own.cov, prior[n:, n:] - gain @ prior[:n, n:], atol=1e-5)
+    np.testing.assert_allclose(own.length_scale, np.exp(knot_u), rtol=1e-4)
+    l_bar = np.exp(result.pseudo.log_extent) * theta[5 + result.pseudo.kind]
+    bar = slice(*result.pseudo.offsets[90:92])
+    np.testing.assert_allclose(
+        [own.pseudo_r, own.pseudo_l], [result.pseudo.r_bar[bar], l_bar[bar]]
+    )
+    with pytest.raises(ConfigError, match=r'segment 180: must be in \[0, 179\]'):
+        result.segment(180)
+    # Over a relief, with neighbours, doubts and tilt: still the points' heights and one posterior.
+    result = GroundSegmenter(sensor_roll=0.05).segment(xyz)
+    assert not result.relief.is_level
+    own, level = result.segment(90), result.pose.level(xyz)
+    heights = level[result.grid.segment == 90, 2]
+    assert np.abs(own.z[:, None] - heights).min(axis=1).max() < 1e-5
+    np.testing.assert_allclose(np.diag(own.cov), own.std**2)
+    assert np.linalg.eigvalsh(own.cov)[0] > -1e-9
+    assert np.abs(own.mean - np.interp(own.knots, own.r[own.inlier], own.z[own.inlier])).max() < 1

@@ -85,7 +85,7 @@ def test_what_is_no_message_and_who_closes_early_leave_the_page_alive(address):
 def test_what_a_control_cannot_be_is_said(sequence):
     name = 'label.ground_tolerance'
     with page.open_server(0) as (server, _):
-        tuner = page.Tuner(server, list_inputs(sequence), Config(), [name])
+        tuner = page.Tuner(server, list_inputs(sequence), Config(), [name, 'sensor.height'])
         shown = {h.label: h for h in server.gui._gui_input_handle_from_uuid.values()}
         for odd in (-1.0, float('nan')):
             shown[f'{name} [m]'].value = odd
@@ -94,3 +94,9 @@ def test_what_a_control_cannot_be_is_said(sequence):
         shown[f'{name} [m]'].value = 0.1
         page._tell(tuner._said, tuner._update)
         assert tuner._said.content == '' and 'changed' in tuner._table.content
+        estimated = shown['sensor.height [m]'].value
+        assert f'sensor: {estimated:.2f} m over the ground (estimated)' in tuner._table.content
+        shown['auto'].value, shown['sensor.height [m]'].value = False, 3.0
+        page._tell(tuner._said, tuner._update)
+        assert f'ground near the sensor is {estimated:.2f} m below' in tuner._said.content
+        assert shown['sensor.height [m]'].value == 3.0

@@ -1,6 +1,5 @@
 """The pictures of `plot`, by their pixels: scans in perspective, segments from the side."""
 
-import math
 import re
 
 import numpy as np
@@ -11,7 +10,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.lab import plotting
 from gp_ground_seg.lab.plotting import (
     CAMERA,
@@ -21,7 +20,6 @@ from gp_ground_seg.lab.plotting import (
     SegmentView,
     camera_at,
     label_layers,
-    line_ends,
     plot_scan_view,
     plot_segment,
     project,
@@ -92,6 +90,9 @@ def test_labels_and_errors_are_where_the_points_are(tmp_path):
         centre, n = where(tmp_path / 'a.png', COLOURS[name])
         assert n > 300
         np.testing.assert_allclose(centre, project(np.array([x, y, -1.75]))[0], atol=0.01)
+    # A room is drawn as large as a street.
+    plot_scan_view(0.1 * points, label, tmp_path / 'a.png', truth=truth)
+    assert all(where(tmp_path / 'a.png', COLOURS[name])[1] > 300 for name in places)
     # Without the truth, and from above.
     above = camera_at(0, 89, 60)
     plot_scan_view(points, label, tmp_path / 'a.png', camera=above)
@@ -117,7 +118,7 @@ def test_clouds_with_nothing_to_see(tmp_path, points):
     for truth in (result.label, None):
         plot_scan_view(points, result.label, path, r'$\nothing _ %', truth=truth)
         assert imread(path).ndim == 3
-        plot_segment(result, Config(), points, [SEGMENT], path, truth, title=r'$\none _ %')
+        plot_segment(result, points, [SEGMENT], path, truth, title=r'$\none _ %')
         assert imread(path).ndim == 3
     assert [*tmp_path.iterdir()] == [path]
 
@@ -158,7 +159,7 @@ def test_pdf_and_svg_hold_points_as_pixels(scan, tmp_path):
 def test_command_draws_a_scan_and_its_errors(scan, tmp_path, capsys):
     path = tmp_path / 'a.png'
     assert run('plot', 'scan', scan, '-o', path) == 0
-    said = r'[\d ]+ points: [\d ]+ ground, [\d ]+ obstacle, written to .*a\.png\n'
+    said = r'sensor: .*\n[\d ]+ points: [\d ]+ ground, [\d ]+ obstacle, written to .*a\.png\n'
     assert re.fullmatch(said, capsys.readouterr().out)
     assert where(path, COLOURS['missed ground'])[1] == 0
     words = ['--labels', scan.with_suffix('.label'), '-o', path, '--force']
@@ -169,20 +170,6 @@ def test_command_draws_a_scan_and_its_errors(scan, tmp_path, capsys):
 # Segments from the side.
 
 
-@pytest.mark.parametrize(
-    ('slope', 'ends'),
-    [
-        (1.0, [[1.0, 3.0], [5.0, 7.0]]),
-        (0.0, [[1.0, 3.0], [6.0, 6.0]]),
-        (math.inf, [[2.0, 2.0], [5.0, 7.0]]),
-        (-math.inf, [[2.0, 2.0], [7.0, 5.0]]),
-    ],
-)
-def test_line_ends_by_hand(slope, ends):
-    r, z = np.array([1.0, 2.0, 3.0]), np.array([5.0, 6.0, 7.0])
-    np.testing.assert_allclose(line_ends(r, z, slope), ends, atol=1e-12)
-
-
 def test_command_draws_segments_side_by_side(scan, tmp_path, capsys):
     """The wall ahead is in the first of the two only; its errors are where they are known."""
     path = tmp_path / 'a.png'
@@ -190,7 +177,7 @@ def test_command_draws_segments_side_by_side(scan, tmp_path, capsys):
     assert run('plot', 'segment', scan, *words) == 0
     result = GroundSegmenter().segment(ahead()[0])
     first, last = result.candidates.offsets[SEGMENT : SEGMENT + 2]
-    assert capsys.readouterr().out == (
+    assert capsys.readouterr().out.partition('\n')[2] == (
         f'segment 90: {last - first} candidates, {result.surface.inlier[first:last].sum()} '
         f'inliers, {np.diff(result.pseudo.offsets)[SEGMENT]} pseudo-inputs; '
         f'segment 91: 0 candidates, 0 inliers, 0 pseudo-inputs, written to {path}\n'
@@ -209,34 +196,25 @@ def test_what_is_drawn_is_the_result():
     above, below = Figure().subplots(2)
     view = SegmentView(result, SEGMENT, points[:, 2])
     view.draw_ground(above)
-    view.draw_length_scale(below, Config())
+    view.draw_length_scale(below)
 
     drawn = {line.get_label(): line for line in above.lines}
-    inside = slice(*result.candidates.offsets[SEGMENT : SEGMENT + 2])
-    own = result.candidates.where(result.candidates.segment == SEGMENT)
-    r, z = own.r, own.z + result.relief.at(own.x, own.y)
-    inlier = result.surface.inlier[inside]
+    own, inside = result.segment(SEGMENT), result.candidates.segment == SEGMENT
     begins = np.flatnonzero(np.diff(result.lines.line[inside])) + 1
     assert len(begins) > 0
-    np.testing.assert_array_equal(drawn['critical points'].get_xdata(), r[begins])
-    np.testing.assert_array_equal(drawn['candidates, inliers'].get_ydata(), z[inlier])
-    knots, n_segments = result.surface.knots, result.grid.n_segments
-    surface = result.surface.mean + result.relief.at_knots(knots, n_segments)
-    assert not result.relief.is_level
-    np.testing.assert_array_equal(drawn['surface'].get_ydata(), surface[SEGMENT])
+    np.testing.assert_array_equal(drawn['critical points'].get_xdata(), own.r[begins])
+    np.testing.assert_array_equal(drawn['candidates, inliers'].get_ydata(), own.z[own.inlier])
+    np.testing.assert_array_equal(drawn['surface'].get_ydata(), own.mean)
     # A line over the relief ends where its first and its last candidate are, nearly.
     lines = [line for line in above.lines if len(line.get_xdata()) == 16]
     assert len(lines) > 1
     for line in lines:
-        ends = np.interp(line.get_xdata()[[0, -1]], r, z)
+        ends = np.interp(line.get_xdata()[[0, -1]], own.r, own.z)
         np.testing.assert_allclose(line.get_ydata()[[0, -1]], ends, atol=0.15)
 
     length_scale, pseudo, *_ = (line.get_data() for line in below.lines)
-    np.testing.assert_array_equal(length_scale[1], np.exp(result.log_length_scale[SEGMENT]))
-    own = slice(*result.pseudo.offsets[SEGMENT : SEGMENT + 2])
-    np.testing.assert_array_equal(pseudo[0], result.pseudo.r_bar[own])
-    values = np.exp(result.pseudo.log_extent[own])
-    np.testing.assert_allclose(pseudo[1], values * result.fit.theta['length_scale_factor'])
+    np.testing.assert_array_equal(length_scale[1], own.length_scale)
+    np.testing.assert_array_equal(pseudo, [own.pseudo_r, own.pseudo_l])
     # The curve follows the pseudo-inputs: it stays among them and near each.
     off = np.abs(np.log(np.interp(pseudo[0], *length_scale) / pseudo[1]))
     assert off.mean() < 0.5 and off.max() < 1.0

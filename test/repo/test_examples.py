@@ -34,6 +34,19 @@ def test_a_folder_without_its_ground(tmp_path, capsys):
     assert f'a {result!r}' in capsys.readouterr().out
 
 
+def test_the_figure_of_a_segment_and_another_kernel(tmp_path, capsys):
+    scan, picture = tmp_path / 'a.npy', tmp_path / 'a.png'
+    np.save(scan, hilly_scan().astype(np.float32))
+    load_script('examples/paper_figure.py').main(scan, '90', picture, 'default')
+    assert re.fullmatch(r'segment 90: \d+ inliers, \d+ pseudo-inputs\n', capsys.readouterr().out)
+    assert picture.stat().st_size > 10_000
+    other = load_script('examples/other_kernel.py')
+    other.LEAST = 20
+    other.main(scan)
+    apart = re.search(r'surfaces (\d\.\d+) m apart; deviation \d\.', capsys.readouterr().out)
+    assert 0.0 < float(apart[1]) < 0.5
+
+
 def test_a_subscriber_hears_the_nearest_obstacle(tmp_path):
     pytest.importorskip('rclpy', reason='ROS is not installed')
     import ros_helpers as ros

@@ -1,4 +1,4 @@
-"""The shape of the package: three rules of compiled code; `make lint` has those of the rooms."""
+"""No dead constant, and three rules of compiled code; `make lint` has those of the rooms."""
 
 import ast
 from functools import cache
@@ -76,10 +76,30 @@ def find_reordered_sums(trees):
                     yield f'{path}: {node.name} adds in any order, and writes to an array'
 
 
-CHECKS = (find_formulas_that_stand_twice, find_returned_arrays, find_reordered_sums)
+def find_dead_constants(trees):
+    """Constants of a module that nothing in the package reads."""
+    read = set()
+    for node in (node for tree in trees.values() for node in ast.walk(tree)):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
+            read.add(node.id)
+        elif isinstance(node, ast.Attribute):
+            read.add(node.attr)
+    for path, tree in trees.items():
+        targets = [t for node in tree.body if isinstance(node, ast.Assign) for t in node.targets]
+        for name in (n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)):
+            if name not in read and not name.startswith('__'):
+                yield f'{path}: {name} is read nowhere'
+
+
+CHECKS = (
+    find_dead_constants,
+    find_formulas_that_stand_twice,
+    find_returned_arrays,
+    find_reordered_sums,
+)
 
 
 @pytest.mark.parametrize('find', CHECKS)
-def test_compiled_code_keeps_the_rules(find):
+def test_the_code_keeps_the_rules(find):
     found = list(find(parse(REPOSITORY / PACKAGE)))
     assert not found, '\n'.join(found)

@@ -50,7 +50,7 @@ def test_package_xml_is_that_of_this_package(package):
     files = [ast.parse(path.read_text()) for path in REPOSITORY.glob('launch/*.launch.py')]
     launched = {name.split('.')[0] for tree in files for name in imports(tree)}
     assert {'launch', 'launch_ros'} <= launched & depends
-    assert launched <= depends | {'pathlib', 'yaml', PACKAGE}
+    assert launched <= depends | {'pathlib', 're', 'yaml', PACKAGE}
 
 
 def test_one_version(package):
@@ -72,7 +72,7 @@ def test_the_address_of_the_repository_is_the_same_everywhere(package):
     for name, line in (
         ('setup.py', f"url='{address}',"),
         ('CITATION.cff', f'repository-code: {address}\n'),
-        ('README.md', f'`git clone {address}.git`'),
+        ('README.md', f'git clone {address}.git && cd gp_ground_seg\n'),
     ):
         assert (REPOSITORY / name).read_text(encoding='utf-8').count(line) == 1, name
 

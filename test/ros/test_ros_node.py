@@ -18,6 +18,7 @@ from sensor_msgs.msg import PointCloud2
 from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.core.pipeline.sensor_pose import LITTLE_GROUND, NO_HEIGHT
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
+from gp_ground_seg.ros import diagnostics
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -64,6 +65,13 @@ def test_a_lazy_node_listens_only_while_somebody_listens_to_it():
         b.publisher.publish(message)  # one: clouds every few milliseconds fill the queue
         labelled.wait(1)
         b.wait_for_status('processing', lambda v, _: v['Dropped since startup'] == '0')
+
+
+def test_the_log_says_now_and_then_what_diagnostics_say(tmp_path, monkeypatch):
+    monkeypatch.setattr(diagnostics, 'LOG_PERIOD', 0.5)
+    with ros.stderr_in(tmp_path) as said, bench({'diagnostics.period': 0.2}) as b:
+        b.segment(to_message(street(3000)))
+        said('so far: 1 clouds segmented, 0 lost, 0 refused; input ', '; model OK: ')
 
 
 def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(tmp_path):

@@ -9,7 +9,7 @@ import ros_helpers as ros
 from nav_msgs.msg import OccupancyGrid
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros_helpers import street, to_message, xyz_of
-from sensor_msgs.msg import LaserScan, PointCloud2, PointField
+from sensor_msgs.msg import LaserScan, PointField
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.parameters.schema import NODE_NAME
@@ -23,10 +23,7 @@ from gp_ground_seg.ros.outputs import MODEL_FIELDS, read_ground_model
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
-OPTIONAL = {
-    '~/labeled': PointCloud2, '~/ground_model': PointCloud2,
-    '~/scan': LaserScan, '~/occupancy': OccupancyGrid,
-}  # fmt: skip
+OPTIONAL = {o.topic: o.message_type for o in outputs.OUTPUTS if o.is_optional}
 CONFIG = Config().replace(**{'learning.mode': 'fixed'})
 
 
@@ -172,7 +169,7 @@ OTHER_QOS = {'depth': 3, 'reliability': 'best_effort'}
 
 def test_quality_of_service_of_every_output_can_be_overridden():
     topics = [o.topic for o in outputs.OUTPUTS]
-    assert set(topics) == {'ground', 'obstacles', *OPTIONAL}
+    assert set(topics) == {'ground', 'obstacles', *OPTIONAL} and len(OPTIONAL) >= 4
     names = (f'qos_overrides./{topic.replace("~", NODE_NAME)}.publisher' for topic in topics)
     values = {f'{name}.{k}': v for name in names for k, v in OTHER_QOS.items()}
     with ros.started_node(*ros.given(values)) as node:

@@ -167,6 +167,34 @@ def _count_near(candidates: Candidates, reach: float) -> IntArray:
     return number
 
 
+def posterior_covariance(
+    frame: Frame, theta: FloatArray, config: Config, surface: GroundSurface, m: int
+) -> FloatArray:
+    """Covariance of the heights of segment m at its first n knots, (n, n) [m^2].
+
+    n knots of the segment have a height. Correlations are those of its own process given its
+    inliers (paper, eq. 7), variances those of `surface`: its neighbours make these smaller, and
+    doubt of an inlier larger.
+    """
+    candidates, n = frame.candidates, int(np.isfinite(surface.mean[m]).sum())
+    own = np.flatnonzero(surface.inlier & (candidates.segment == m))
+    u, knot_u = log_length_scales(frame, theta, config)
+    r = np.concatenate([candidates.r[own], frame.knots[:n]])
+    l = np.exp(np.concatenate([u[own], knot_u[m, :n]]))  # noqa: E741
+    sill, noise = variances_of(theta)
+    prior = paciorek(r[:, None], l[:, None], r, l, sill)
+    prior += line_covariance(r[:, None], r, *line_variances(config.observation))
+    if config.label.rule == 'roughness':
+        alike = _count_near(candidates, np.exp(given_theta(config)[3]))
+        noise = noise_among(alike[own], noise)
+    given, cross = prior[: len(own), : len(own)] + np.eye(len(own)) * noise, prior[: len(own)]
+    cov = prior - cross.T @ np.linalg.solve(given, cross)
+    cov = cov[len(own) :, len(own) :]
+    scale = surface.std[m, :n] / np.sqrt(np.diag(cov))
+    result: FloatArray = cov * np.outer(scale, scale)
+    return result
+
+
 @shared
 def noise_in_doubt(
     z: Values, height: Values, variance: Values, noise: Values, in_face: Values, odds: Values

@@ -203,7 +203,8 @@ class GrowthConfig(ParameterGroup):
         'horizontal range within which low candidates start the inlier set', 'm')
     seed_height_tolerance: float = basic(0.45, (0.01, 5.0),
         'largest height of a seed above or below the expected ground; in proportion to the height '
-        'of a sensor below 1 m', 'm')
+        'of a sensor below 1 m; larger: a ramp near the sensor can be ground, and so can a low '
+        'object', 'm')
     max_std: float = advanced(0.25, (0.001, 10.0),
         'predictive standard deviation above which a candidate is not decided yet; in proportion '
         'to the height of a sensor below 1 m', 'm')
@@ -248,8 +249,9 @@ class LabelConfig(ParameterGroup):
         'roughness = ground up to ground_tolerance, or higher where the ground about it is rough; '
         'returns at one height then vote; tolerance = ground_tolerance alone, above and below')
     ground_tolerance: float = basic(0.1, (0.001, 5.0),
-        'height above the surface up to which a return is ground in any case; more = more ground; '
-        'in proportion to the height of a sensor below 1 m', 'm', 'zeta_g')
+        'height above the surface up to which a return is ground; in proportion to the height of '
+        'a sensor below 1 m; larger: kerbs and grass become ground, low objects too, and other '
+        'returns count as vertical faces', 'm', 'zeta_g')
     obstacle_min_height: float = advanced(0.2, (0.01, 10.0),
         'least height over the ground of an obstacle that matters: on rough ground, a vertical '
         'face that stands so much higher than ground_tolerance is one; in proportion to the '
