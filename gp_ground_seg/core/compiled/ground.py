@@ -17,8 +17,8 @@ from gp_ground_seg.core.compiled.numerics import LANES
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, IntArray
 from gp_ground_seg.core.gp.evidence import between_knots, combined, contradicts
 from gp_ground_seg.core.gp.ground import (
+    carries_on,
     fits,
-    goes_on,
     noise_among,
     noise_in_doubt,
     variances_of,
@@ -324,7 +324,7 @@ def _find_joining(
             rise, distance = z[i] - z[last], r[i] - r[last]
             walkable = is_walkable(rise, distance, growth.max_slope)
             if walkable and not own.in_face[i] and not columns.above[i]:
-                joins = goes_on(rise, distance, own.onward[i])
+                joins = carries_on(rise, distance, own.onward[i])
             else:
                 last = -1  # it stands on the ground, which does not go on behind it
         if joins:

@@ -229,7 +229,7 @@ def grow_inliers(
     ``growth.max_std`` and its standardised residual is at most
     ``growth.max_standardised_residual`` above the prediction, or
     ``growth.max_standardised_depth`` below; or when the ground goes on to it from the inlier
-    before (see `goes_on`). This repeats until none joins (GP-INSAC of Chen et al. 2014; the
+    before (see `carries_on`). This repeats until none joins (GP-INSAC of Chen et al. 2014; the
     paper's outlier rejection). The gate is asymmetric because obstacles stand only above the
     ground.
 
@@ -346,12 +346,12 @@ def _on_slope(
     distance = batch.r - batch.r[own, before]
     walkable = is_walkable(rise, distance, growth.max_slope) & ~batch.in_face & ~batch.above
     is_open = (before >= 0) & (last(~chosen & ~fitting & ~walkable) < before)
-    result: BoolArray = is_open & walkable & goes_on(rise, distance, batch.onward)
+    result: BoolArray = is_open & walkable & carries_on(rise, distance, batch.onward)
     return result
 
 
 @shared
-def goes_on(rise: Values, distance: Values, onward: Values) -> Values:
+def carries_on(rise: Values, distance: Values, onward: Values) -> Values:
     """Whether ground that rises so much [m] over a distance [m] goes on so.
 
     `onward` is the slope behind: where it is less, the ground has come to an object. Ground that
