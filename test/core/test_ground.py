@@ -11,7 +11,7 @@ from gp_ground_seg.core.frame import Frame
 from gp_ground_seg.core.gp.learning import given_theta
 
 # Compiled code predicts in single precision: errors of length-scale, mean, std in tests.
-TOLERANCES = {'numpy': (1e-9, 1e-7, 1e-5), 'numba': (1e-5, 1e-5, 1e-5)}
+TOLERANCES = {'numpy': (1e-9, 1e-7, 1e-5), 'numba': (1e-5, 2e-4, 2e-4)}
 
 
 def frame_of(xyz, config):
@@ -44,11 +44,13 @@ def draw_frame(seed, of_paper):
     config = config_of(**{
         'length_scale.model': str(rng.choice(['latent', 'latent', 'line_gradient', 'constant'])),
         'observation.slope_std': 0.05 * (has_sill or int(rng.integers(0, 2))),
+        'observation.slope_drift': 0.03 * int(rng.integers(0, 2)),
         'surface.look_aside': not of_paper,
         # Fewer segments than fit into one batch, or more; some of them empty.
         'grid.n_segments': int(rng.choice([5, 7, 35, fewer(96, 12)])),
         'grid.n_bins': 80,
         'label.rule': 'tolerance' if of_paper else 'roughness',
+        'growth.max_slope': 0.0 if of_paper else float(rng.choice([0.1, 0.4])),
         'growth.max_std': float(rng.choice([0.1, 0.35, 1.0])),
         'growth.max_standardised_residual': float(rng.choice([1.0, 2.0, 8.0])),
         'growth.max_standardised_depth': float(rng.choice([2.0, 4.0])),
@@ -56,10 +58,6 @@ def draw_frame(seed, of_paper):
         'growth.seed_height_tolerance': 0.45 if has_sill else float(rng.choice([0.2, 0.45])),
     })  # fmt: skip
     frame = frame_of(xyz[rng.random() * xyz[:, 1] > -5.0], config)
-    # Lines that are steep, as of walls, are followed too.
-    continues_line = ~np.bool_(of_paper) & (rng.random(len(frame.candidates.r)) < 0.5)
-    if of_paper or rng.random() < 0.5:
-        frame = frame._replace(continues_line=continues_line)
     theta = given_theta(config)
     theta += np.where(np.arange(6) < 5, 0.3, 1.0) * rng.normal(size=theta.shape)
     if rng.random() < 0.3 and not has_sill:

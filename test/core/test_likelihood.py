@@ -11,9 +11,13 @@ from gp_ground_seg.core.compiled import likelihood as compiled
 from gp_ground_seg.core.frame import Inliers
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.core.gp.likelihood import log_likelihood
+from gp_ground_seg.core.parameters.config import ObservationConfig
+from gp_ground_seg.core.parameters.schema import numbers_of
 
 # With a factor for each class of lines.
 FACTORS = np.array([0.8, 0.5, 1.3, 1.0, 0.7, 2.0, 0.9, 1.1, 0.6])
+PRIOR = numbers_of(ObservationConfig(slope_std=0.05, slope_drift=0.01))
+LEVEL = numbers_of(ObservationConfig(slope_std=0.0, slope_drift=0.0))
 TYPICAL = np.log([0.3, 0.05, 0.9, 3.0, 0.25, *FACTORS])
 
 
@@ -73,7 +77,7 @@ def random_inliers(seed, bars='all', n_segments=6):
 @functools.cache
 def expected(name, latent_terms, bars):
     return reference_gp.log_likelihood(
-        THETAS[name], random_inliers(7, bars, 4), 0.05, latent_terms
+        THETAS[name], random_inliers(7, bars, 4), PRIOR, latent_terms
     )
 
 
@@ -82,7 +86,7 @@ def expected(name, latent_terms, bars):
 @pytest.mark.parametrize('bars', ['all', 'some', 'none'])
 def test_value_and_gradient_are_those_of_the_reference(likelihood, name, latent_terms, bars):
     inliers = random_inliers(7, bars, 4)
-    value, gradient = likelihood(THETAS[name], inliers, 0.05, latent_terms)
+    value, gradient = likelihood(THETAS[name], inliers, PRIOR, latent_terms)
     expected_value, numeric = expected(name, latent_terms, bars)
     assert value == pytest.approx(expected_value, rel=1e-8, abs=1e-6)
     # A component far smaller than the others is only as exact as their rounding.
@@ -106,7 +110,7 @@ def test_without_a_factor_the_value_is_minus_infinity_and_nothing_is_raised(
     inliers = random_inliers(4)
     inliers = inliers._replace(**{k: np.full_like(inliers.z, v) for k, v in changes.items()})
     for find in (likelihood, reference_gp.log_likelihood):
-        value, gradient = find(theta, inliers, 0.0, False)
+        value, gradient = find(theta, inliers, LEVEL, False)
         assert value == -np.inf
         assert not gradient.any()
 
@@ -115,4 +119,4 @@ def test_beyond_the_bound_of_length_scales_nothing_depends_on_the_latent_process
     inliers = random_inliers(5)
     beyond = TYPICAL.copy()
     beyond[5:] = MAX_ABS_LOG_LENGTH_SCALE + 10.0
-    assert not likelihood(beyond, inliers, 0.05, False)[1][2:].any()
+    assert not likelihood(beyond, inliers, PRIOR, False)[1][2:].any()

@@ -11,7 +11,12 @@ from reference import extract_lines, pseudo_inputs
 
 from gp_ground_seg import Config
 from gp_ground_seg.core.frame import Candidates, Faces
-from gp_ground_seg.core.pipeline.lines import deming_slope, differs_in_direction
+from gp_ground_seg.core.gp.ground import carries_on
+from gp_ground_seg.core.pipeline.lines import (
+    deming_slope,
+    differs_in_direction,
+    is_walkable,
+)
 
 N_TILES = 50
 NO_FACES = Faces(*np.zeros((2, N_TILES), dtype=bool))
@@ -65,10 +70,7 @@ def draw_candidates(seed, n_segments=8, most=30):
     return candidates_of(r, z, np.exp(density), offsets)._replace(tile=tile)
 
 
-BOUNDS = (
-    'growth.max_line_slope', 'growth.min_line_size', 'growth.min_bend_extent',
-    'lines.max_density_ratio',
-)  # fmt: skip
+BOUNDS = 'growth.max_slope', 'growth.min_rise_extent', 'lines.max_density_ratio'
 
 
 def draw_faces(seed):
@@ -81,7 +83,7 @@ def draw_faces(seed):
     st.sampled_from([1.0, 2.5, 3.0, 10.0]),
     st.floats(0.2, 5.0),
     st.sampled_from(['factor', 'classes']),
-    st.sampled_from([(1.0, 4, 3.0, 8.0), (0.2, 3, 9.0, 1.5), (10.0, 7, 1.0, 100.0)]),
+    st.sampled_from([(1.0, 3.0, 8.0), (0.2, 9.0, 1.5), (10.0, 1.0, 100.0)]),
 )
 def test_lines_and_pseudo_inputs_are_the_reference(
     compiled_code, seed, per, error_ratio, shared, bounds
@@ -123,14 +125,14 @@ AHEAD = {
 
 
 @pytest.mark.parametrize('name', AHEAD)
-def test_a_slope_break_is_followed_and_a_step_is_not(backend, name):
+def test_the_ground_carries_on_to_a_slope_and_not_to_a_step(backend, name):
     ahead, is_followed = AHEAD[name]
     candidates = candidates_of(5.0 + 4.0 * np.arange(7), np.append(np.zeros(3), ahead))
-    _, lines, _, continues, _ = backend.extract_lines(candidates, NO_FACES, Config())
+    _, lines, _, onward, _ = backend.extract_lines(candidates, NO_FACES, Config())
     assert list(lines.start) == [0, 3, 7]
-    assert continues[3] == is_followed
-    # The others of a flat line follow the one before them.
-    assert (continues[4:] == (name != 'a steep bank')).all()
+    follows = is_walkable(ahead[0], 4.0, 0.2) and carries_on(ahead[0], 4.0, onward[3])
+    assert follows == is_followed
+    assert onward[5] == onward[6] == -np.inf  # too few behind
 
 
 def test_a_candidate_far_below_changes_no_line_of_other_segments(backend):

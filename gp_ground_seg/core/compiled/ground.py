@@ -33,7 +33,7 @@ from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
 from gp_ground_seg.core.pipeline.lines import is_walkable
 
-ROUNDING = 1e-7
+ROUNDING = 1e-6
 """Least noise of what is observed, in parts of the largest prior variance: the rounding of single
 precision."""
 
