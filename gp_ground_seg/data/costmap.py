@@ -29,7 +29,14 @@ from gp_ground_seg.core.parameters.config import ANY_HEIGHT, Config
 from gp_ground_seg.core.pipeline.sensor_pose import LEAST_COSINE
 from gp_ground_seg.core.result import Segmentation, cached_property
 from gp_ground_seg.data.point_cloud2 import read_xyz
-from gp_ground_seg.data.step_edges import SECTORS, Edges, across_sectors, find_edges
+from gp_ground_seg.data.step_edges import (
+    MARGIN,
+    SECTORS,
+    Edges,
+    across_sectors,
+    find_edges,
+    standing_level,
+)
 
 DIRECTIONS = 720
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -113,7 +120,7 @@ class SegmentedCloud:
         """Places of the obstacles, and `Blocked` if ``output.max_step_down`` is not 0."""
         if self.config.output.max_step_down == 0.0:
             return self.places(self.is_obstacle)
-        edges, pose, heading = self._found, self.segmentation.pose, self.heading
+        edges, pose, heading = self._found, self.segmentation.pose, self._rotation[:2, :2]
         stands = self.places(self.is_obstacle & ~edges.is_before)
         both = zip(stands, self._in_plane(*self.edges.T), strict=True)
         blocked = Blocked(*(np.concatenate([a, b.astype(a.dtype)]) for a, b in both))
@@ -137,21 +144,35 @@ class SegmentedCloud:
         return self._in_cloud(self._found.points())
 
     @cached_property
+    def _rotation(self) -> FloatArray:
+        """Matrix (3, 3) into the frame in which the ground that the robot stands on is level.
+
+        A robot that pitches by less than what a scan is levelled for would see steps in level ground.
+        """
+        pose = self.segmentation.pose
+        xyz = self._about_sensor(pose.rotation)[self.is_ground]
+        return standing_level(xyz, pose.sensor_height) @ pose.rotation
+
+    @cached_property
     def _found(self) -> Edges:
         found = self.segmentation
-        # What lies below the surface does not stand on it, and tells how deep a drop is.
-        stands = (found.label == _OBSTACLE) & ~(found.labelled.height < 0.0)
-        # Rays begin at the sensor, which is not the origin of a cloud in the frame of a vehicle.
-        with np.errstate(over='ignore', invalid='ignore'):
-            xyz = (self.points - np.array(found.pose.origin)) @ found.pose.rotation.T
-        xyz[found.grid.cell == NOT_FINITE] = np.nan
         limit, height = self.config.output.max_step_down, found.pose.sensor_height
+        xyz, over = self._about_sensor(self._rotation), found.labelled.height
+        # What lies below the surface, or without one below the robot, does not stand on it, and
+        # tells how deep a drop is.
+        over = np.where(np.isnan(over), xyz[:, 2] + height, over)
+        stands = (found.label == _OBSTACLE) & ~(over < 0.0)
+        xyz[found.grid.cell == NOT_FINITE] = np.nan
         return find_edges(xyz, self.is_ground, stands, limit, height)
 
+    def _about_sensor(self, turn: FloatArray) -> FloatArray:
+        """All points about the sensor, where rays begin, turned by a matrix, (N, 3) [m]."""
+        with np.errstate(over='ignore', invalid='ignore'):
+            return np.asarray((self.points - np.array(self.segmentation.pose.origin)) @ turn.T)
+
     def _in_cloud(self, level: FloatArray) -> FloatArray:
-        """Points of the level frame about the sensor in the frame of the cloud, (n, 3) [m]."""
-        pose = self.segmentation.pose
-        return np.asarray(level @ pose.rotation + np.array(pose.origin))
+        """Points of the frame of the edges in the frame of the cloud, (n, 3) [m]."""
+        return np.asarray(level @ self._rotation + np.array(self.segmentation.pose.origin))
 
     def _in_plane(self, x: PointArray, y: PointArray, z: PointArray) -> Places:
         """Places of points of the cloud, (n,) each, as `places` gives them."""
@@ -206,9 +227,8 @@ def scan_ranges(obstacles: Places, returns: Places) -> Ranges:
     is_seen[direction_of(*returns)] = True
     ranges[~is_seen] = np.nan
     if isinstance(obstacles, Blocked):
-        ranges[(ranges > obstacles.first) | (np.isinf(ranges) & (obstacles.behind < np.inf))] = (
-            np.nan
-        )
+        is_behind = MARGIN * ranges > obstacles.first
+        ranges[is_behind | (np.isinf(ranges) & (obstacles.behind < np.inf))] = np.nan
     return ranges
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import struct
 import time
 from collections import deque
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from geometry_msgs.msg import Quaternion
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.time import Time
 from sensor_msgs.msg import Imu, PointCloud2
 from std_msgs.msg import Header
@@ -31,6 +33,7 @@ MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]
 LONGEST_WAIT = 1.0  # the same, where it would be refused, and older messages still come [s]
 REVIEW_PERIOD = 0.005  # time between two checks of whether they have come [s]
 IMU_TOLERANCE = 0.05  # longest time between a cloud and its orientation [s]
+CDR_HEADER = 4  # bytes before the content of a serialised message
 DEPTH = 1000  # messages kept: those of 1 s at 1 kHz
 BEST_EFFORT = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE)
@@ -111,15 +114,17 @@ class Unattended(CallbackGroup):  # type: ignore[misc]
 
 
 class ImuListener:
-    """Keeps what ``imu`` has sent."""
+    """Keeps what ``imu`` has sent, as its bytes: of 20 messages one is read."""
 
     def __init__(self, node: Node) -> None:
         self.topic: str = node.resolve_topic_name('imu')
-        self._messages: deque[tuple[float, Imu]] = deque(maxlen=DEPTH)  # with their stamps [s]
+        self._messages: deque[tuple[float, bytes]] = deque(maxlen=DEPTH)  # with their stamps [s]
 
-    def take(self, message: Imu) -> float:
+    def take(self, message: bytes) -> float:
         """Keep a message; return its stamp [s]."""
-        stamp = seconds_of(message.header.stamp)
+        order = '<' if message[1] & 1 else '>'
+        seconds, nanoseconds = struct.unpack_from(f'{order}iI', message, CDR_HEADER)
+        stamp = float(seconds + 1e-9 * nanoseconds)
         self._messages.append((stamp, message))
         return stamp
 
@@ -134,12 +139,13 @@ class ImuListener:
         """
         if not self._messages:
             raise PointCloudError(f'no message on {self.topic}, for frame.level = imu')
-        off, found = min(((abs(t - stamp), m) for t, m in self._messages), key=itemgetter(0))
+        off, raw = min(((abs(t - stamp), m) for t, m in self._messages), key=itemgetter(0))
         if off > IMU_TOLERANCE:
             raise PointCloudError(
                 f'the nearest orientation on {self.topic} is {off:.3g} s from its stamp: '
                 f'must be within {IMU_TOLERANCE:g} s'
             )
+        found = deserialize_message(raw, Imu)
         if found.orientation_covariance[0] == -1.0:
             raise PointCloudError(
                 f'{self.topic} has no orientation (orientation_covariance[0] is -1): remap imu to '
@@ -148,11 +154,12 @@ class ImuListener:
         return found, off
 
 
-def keep_transforms(keep: Callable[[Any, str], None], message: Any) -> float:
-    """Pass what TF has sent in a `message` to `keep`; return the newest stamp in it [s]."""
-    for transform in message.transforms:
+def keep_transforms(keep: Callable[[Any, str], None], kind: Any, raw: bytes) -> float:
+    """Pass the transforms in a message of TF to `keep`; return the newest stamp in it [s]."""
+    transforms = deserialize_message(raw, kind).transforms
+    for transform in transforms:
         keep(transform, 'default_authority')
-    return max((seconds_of(t.header.stamp) for t in message.transforms), default=0.0)
+    return max((seconds_of(t.header.stamp) for t in transforms), default=0.0)
 
 
 class FrameListener:
@@ -171,7 +178,7 @@ class FrameListener:
         self._imu = self._buffer = None
         self._not_yet: Any = ()  # what TF raises
         self._too_late: Any = ()
-        sources: list[tuple[Any, str, Callable[[Any], float], QoSProfile]] = []
+        sources: list[tuple[Any, str, Callable[[bytes], float], QoSProfile]] = []
         if config.frame.level == 'imu':
             self._imu = ImuListener(node)
             sources += [(Imu, 'imu', self._imu.take, BEST_EFFORT)]  # takes from any publisher
@@ -181,8 +188,8 @@ class FrameListener:
             # and in some releases raises an error there that ends the executor. See `time_jumped`.
             self._buffer = tf2.Buffer()
             kind = find_module('tf2_msgs.msg').TFMessage
-            keep = partial(keep_transforms, self._buffer.set_transform)
-            keep_static = partial(keep_transforms, self._buffer.set_transform_static)
+            keep = partial(keep_transforms, self._buffer.set_transform, kind)
+            keep_static = partial(keep_transforms, self._buffer.set_transform_static, kind)
             sources += [(kind, '/tf', keep, RELIABLE), (kind, '/tf_static', keep_static, LATCHED)]
         group = Unattended()
         self._subscriptions = [
@@ -202,10 +209,12 @@ class FrameListener:
     def _take_all(self) -> None:
         """Take all that TF and IMU have sent."""
         for source in self._subscriptions:
+            newest, now = None, time.monotonic()
             with source.handle:
-                while (taken := source.handle.take_message(source.msg_type, False)) is not None:
+                while (taken := source.handle.take_message(source.msg_type, True)) is not None:
                     newest = source.callback(taken[0])
-                    self._news[source.topic_name] = newest, time.monotonic()
+            if newest is not None:
+                self._news[source.topic_name] = newest, now
 
     def _review(self) -> None:
         self._take_all()

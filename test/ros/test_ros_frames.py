@@ -117,11 +117,12 @@ def tf(monkeypatch):
     return buffer
 
 
-def test_what_tf_sends_is_kept_and_its_newest_stamp_known():
+def test_what_tf_sends_is_kept_and_its_newest_stamp_known(monkeypatch):
     kept, known = [], [TransformStamped(child_frame_id=name) for name in 'ab']
     known[0].header.stamp.sec = 7
     message = types.SimpleNamespace(transforms=known)
-    assert transforms.keep_transforms(lambda one, _: kept.append(one), message) == 7.0
+    monkeypatch.setattr(transforms, 'deserialize_message', lambda _raw, _kind: message)
+    assert transforms.keep_transforms(lambda one, _: kept.append(one), None, b'') == 7.0
     assert kept == known
 
 
