@@ -31,7 +31,7 @@ from gp_ground_seg.ros.input import STEADY_CLOCK, OnCloud, seconds_of
 KEPT_JUMP = 1.0  # after a longer jump back in time, transforms are forgotten [s]
 MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]
 LONGEST_WAIT = 1.0  # the same, where it would be refused, and older messages still come [s]
-REVIEW_PERIOD = 0.005  # time between two checks of whether they have come [s]
+REVIEW_PERIOD = 0.01  # time between two checks of whether they have come [s]
 IMU_TOLERANCE = 0.05  # longest time between a cloud and its orientation [s]
 CDR_HEADER = 4  # bytes before the content of a serialised message
 DEPTH = 1000  # messages kept: those of 1 s at 1 kHz
