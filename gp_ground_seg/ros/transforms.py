@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import struct
 import time
 from collections import deque
@@ -116,6 +117,8 @@ class Unattended(CallbackGroup):  # type: ignore[misc]
 class ImuListener:
     """Keeps what ``imu`` has sent, as its bytes: of 20 messages one is read."""
 
+    newest = -math.inf  # stamp of the message that came last [s]
+
     def __init__(self, node: Node) -> None:
         self.topic: str = node.resolve_topic_name('imu')
         self._messages: deque[tuple[float, bytes]] = deque(maxlen=DEPTH)  # with their stamps [s]
@@ -124,13 +127,9 @@ class ImuListener:
         """Keep a message; return its stamp [s]."""
         order = '<' if message[1] & 1 else '>'
         seconds, nanoseconds = struct.unpack_from(f'{order}iI', message, CDR_HEADER)
-        stamp = float(seconds + 1e-9 * nanoseconds)
-        self._messages.append((stamp, message))
-        return stamp
-
-    def reaches(self, stamp: float) -> bool:
-        """Return whether it has sent something as new as a cloud of that `stamp` [s]."""
-        return bool(self._messages) and self._messages[-1][0] >= stamp
+        self.newest = float(seconds + 1e-9 * nanoseconds)
+        self._messages.append((self.newest, message))
+        return self.newest
 
     def at(self, stamp: float) -> tuple[Imu, float]:
         """Return the message nearest to the `stamp` of a cloud, and how far that is off [s].
@@ -197,6 +196,7 @@ class FrameListener:
         ]
         self._waiting: deque[tuple[float, Header, Callable[[], None]]] = deque()
         self._held = 0.0  # how long the cloud that is used now was held [s]
+        self._found: CloudFrames | None = None  # what is known of it
         self._timer = node.create_timer(REVIEW_PERIOD, self._review, clock=STEADY_CLOCK)
         self._timer.cancel()
 
@@ -231,11 +231,11 @@ class FrameListener:
     def _has_to_wait(self, header: Header, since: float) -> bool:
         """Return whether the pose at the stamp of a cloud, held `since` then, may still come."""
         stamp, waited = seconds_of(header.stamp), time.monotonic() - since
-        is_early = waited < MAX_WAIT
-        if is_early and self._imu is not None and not self._imu.reaches(stamp):
+        is_early, self._found = waited < MAX_WAIT, None
+        if is_early and self._imu is not None and self._imu.newest < stamp:
             return True
         try:
-            self.look_up(header, is_exact=is_early)
+            self._found = self._frames_at(header, is_exact=is_early)
         except self._not_yet:
             return True
         except (PointCloudError, ValueError):  # the cloud is refused with the reason
@@ -247,12 +247,15 @@ class FrameListener:
         soon = time.monotonic() - MAX_WAIT
         return any(newest < stamp and came > soon for newest, came in self._news.values())
 
-    def look_up(self, header: Header, is_exact: bool = False) -> CloudFrames:
-        """Return tilt and place of the sensor at the stamp of a cloud, as the parameters ask.
+    def look_up(self, header: Header) -> CloudFrames:
+        """Return tilt and place of the sensor at the stamp of the cloud that is used now.
 
-        If TF does not reach the stamp, its newest transform is used, unless it `is_exact`. Raises
-        a PointCloudError if a transform or an orientation is missing.
+        If TF does not reach the stamp, its newest transform is used. Raises a PointCloudError if a
+        transform or an orientation is missing.
         """
+        return (self._found or self._frames_at(header))._replace(waited=self._held)
+
+    def _frames_at(self, header: Header, is_exact: bool = False) -> CloudFrames:
         tilt, origin, base, ages = None, None, None, [0.0]
         frame_id, frame, stamp = header.frame_id, self.config.frame, seconds_of(header.stamp)
 
@@ -277,7 +280,7 @@ class FrameListener:
         if frame.sensor != NO_FRAME:
             way = f'from frame.sensor = {frame.sensor!r} to its frame {frame_id!r}'
             origin = _translation_of(transform(frame_id, frame.sensor, way), way)
-        return CloudFrames(tilt, origin, base, max(ages), self._held)
+        return CloudFrames(tilt, origin, base, max(ages))
 
     def _look_up(self, target: str, source: str, stamp: Time, way: str, is_exact: bool) -> Any:
         if self._buffer is None:

@@ -390,7 +390,7 @@ def test_edges_lie_where_the_ground_ends_in_any_frame():
         (vehicle, np.eye(3), math.cos(0.3)),
     ]
     for cloud, matrix, forward in clouds:
-        x, y = cloud.blocked
+        x, y, *_ = cloud.blocked
         x, y = (np.stack([x, y, 0.0 * x], axis=-1) @ matrix.T)[:, :2].T
         along = (x * math.cos(0.3) + y * math.sin(0.3))[np.count_nonzero(cloud.is_obstacle) :]
         assert np.median(along) == pytest.approx(5.85 + forward, abs=0.15)
