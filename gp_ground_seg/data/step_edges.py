@@ -44,11 +44,9 @@ N_ROUGHNESS = 2.5
 BEFORE, BEHIND, WIDTH = 0.4, 1.5, 3
 """Window of the ground before a step, as a share of its range; factor from the beginning of a
 window behind it to the end; sectors on each side that the windows take in."""
-WINDOWS = 2.0, 3.0, 4.5, 6.75, 10.0
-"""Where windows about the sensor begin [m]: where it is rough, a step must be larger."""
-ON_SLOPE, MIN_DESCENT, MAX_ON_SLOPE = 0.35, 0.02, 0.2
+ON_SLOPE, MIN_DESCENT = 0.35, 0.02
 """A step is part of a descent if the ground before or behind it has at least this share of its
-slope; least descent to the next ring behind [m]; largest share of such steps in an edge."""
+slope; least descent to the next ring behind [m]."""
 NEXT_RING = 0.97
 """The slope behind a step is that to the return whose line of sight has this share of the slope of
 the line of sight at the step."""
@@ -314,7 +312,7 @@ def _steps(returns: _Returns, upper: IntArray, slope: FloatArray, max_step_down:
     *_, near = ground.window(sector[upper], begin, BEHIND * begin)
     *_, far = ground.window(sector[upper], BEHIND * begin, BEHIND**2 * begin)
     behind = np.where(slope_before == 0.0, np.maximum(near, far), np.minimum(near, far))
-    roughness = np.maximum(np.maximum(roughness, behind), ground.roughness())
+    roughness = np.maximum(roughness, behind)
     following, known = _next_ring(returns, lower, NEXT_RING)
     descent = z[lower] - z[following]
     goes_on = known & (descent >= ON_SLOPE * slope * (r[following] - r[lower]))
@@ -387,12 +385,6 @@ class _Ground(NamedTuple):
         terms = np.stack([np.ones(len(r)), z, z * z, r, r * r, r * z])
         return cls(key[order], np.pad(np.cumsum(terms, axis=1), ((0, 0), (1, 0))))
 
-    def roughness(self) -> float:
-        """Median of the standard deviations in windows all around the sensor [m]."""
-        begin, sector = np.meshgrid(WINDOWS, np.arange(0, SECTORS, 2 * WIDTH + 1))
-        std = self.window(sector.ravel(), begin.ravel(), BEHIND * begin.ravel())[-1]
-        return float(np.median(std[std > 0.0])) if std.any() else 0.0
-
     def window(
         self, sector: IntArray, begin: FloatArray, end: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -438,5 +430,4 @@ def _is_edge(steps: _Steps, near: FloatArray, max_step_down: float) -> bool:
         2.0 * math.pi / SECTORS * near.sum() >= MIN_WIDTH
         and n_certain >= MIN_STEPS
         and np.count_nonzero(is_strong) >= MIN_STRONG * n
-        and np.count_nonzero(steps.is_on_slope) <= MAX_ON_SLOPE * n
     )
