@@ -29,7 +29,14 @@ from gp_ground_seg.core.parameters.config import ANY_HEIGHT, Config
 from gp_ground_seg.core.pipeline.sensor_pose import LEAST_COSINE
 from gp_ground_seg.core.result import Segmentation, cached_property
 from gp_ground_seg.data.point_cloud2 import read_xyz
-from gp_ground_seg.data.step_edges import SECTORS, Edges, across_sectors, find_edges
+from gp_ground_seg.data.step_edges import (
+    MARGIN,
+    SECTORS,
+    Edges,
+    across_sectors,
+    find_edges,
+    standing_level,
+)
 
 DIRECTIONS = 720
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -43,14 +50,11 @@ Ranges = npt.NDArray[np.float32]
 Places = tuple[PointArray, PointArray]
 
 
-class _XY(NamedTuple):
-    x: PointArray
-    y: PointArray
-
-
-class Blocked(_XY):
+class Blocked(NamedTuple):
     """Places that are in the way, and what falls of the ground hide: no evidence is never free."""
 
+    x: PointArray
+    y: PointArray
     hides: Callable[[FloatArray, FloatArray], BoolArray]  # whether places are behind falls
     # (DIRECTIONS,) range of the first return, and of any, if it is behind a fall [m]
     first: Ranges
@@ -109,22 +113,25 @@ class SegmentedCloud:
         return self._in_plane(*(values.take(index) for values in self.points.T))
 
     @cached_property
-    def blocked(self) -> Places:
+    def blocked(self) -> Places | Blocked:
         """Places of the obstacles, and `Blocked` if ``output.max_step_down`` is not 0."""
         if self.config.output.max_step_down == 0.0:
             return self.places(self.is_obstacle)
-        edges, pose, heading = self._found, self.segmentation.pose, self.heading
+        edges, pose, heading = self._found, self.segmentation.pose, self._rotation[:2, :2]
         stands = self.places(self.is_obstacle & ~edges.is_before)
         both = zip(stands, self._in_plane(*self.edges.T), strict=True)
-        blocked = Blocked(*(np.concatenate([a, b.astype(a.dtype)]) for a, b in both))
+        x, y = (np.concatenate([a, b.astype(a.dtype)]) for a, b in both)
         ahead, left, _ = pose.origin
-        blocked.hides = lambda x, y: edges.hides(*(heading @ np.stack([x - ahead, y - left])))
         level = np.full(SECTORS, -pose.sensor_height)
-        blocked.first, blocked.behind = (
+        first, behind = (
             ranges_of(*self._in_plane(*self._in_cloud(across_sectors(r, level)).T))[0]
             for r in (edges.first, edges.behind)
         )
-        return blocked
+        # In the plane of the cloud turned as the frame of the edges is.
+        return Blocked(
+            x, y, lambda x, y: edges.hides(*(heading @ np.stack([x - ahead, y - left]))),
+            first, behind,
+        )  # fmt: skip
 
     @cached_property
     def edges(self) -> FloatArray:
@@ -137,21 +144,35 @@ class SegmentedCloud:
         return self._in_cloud(self._found.points())
 
     @cached_property
+    def _rotation(self) -> FloatArray:
+        """Matrix (3, 3) into the frame in which the ground that the robot stands on is level.
+
+        A robot that pitches by less than what a scan is levelled for sees steps in level ground.
+        """
+        pose = self.segmentation.pose
+        xyz = self._about_sensor(pose.rotation)[self.is_ground]
+        return standing_level(xyz, pose.sensor_height) @ pose.rotation
+
+    @cached_property
     def _found(self) -> Edges:
         found = self.segmentation
-        # What lies below the surface does not stand on it, and tells how deep a drop is.
-        stands = (found.label == _OBSTACLE) & ~(found.labelled.height < 0.0)
-        # Rays begin at the sensor, which is not the origin of a cloud in the frame of a vehicle.
-        with np.errstate(over='ignore', invalid='ignore'):
-            xyz = (self.points - np.array(found.pose.origin)) @ found.pose.rotation.T
-        xyz[found.grid.cell == NOT_FINITE] = np.nan
         limit, height = self.config.output.max_step_down, found.pose.sensor_height
+        xyz, over = self._about_sensor(self._rotation), found.labelled.height
+        # What lies below the surface, or without one below the robot, does not stand on it, and
+        # tells how deep a drop is.
+        over = np.where(np.isnan(over), xyz[:, 2] + height, over)
+        stands = (found.label == _OBSTACLE) & ~(over < 0.0)
+        xyz[found.grid.cell == NOT_FINITE] = np.nan
         return find_edges(xyz, self.is_ground, stands, limit, height)
 
+    def _about_sensor(self, turn: FloatArray) -> FloatArray:
+        """All points about the sensor, where rays begin, turned by a matrix, (N, 3) [m]."""
+        with np.errstate(over='ignore', invalid='ignore'):
+            return np.asarray((self.points - np.array(self.segmentation.pose.origin)) @ turn.T)
+
     def _in_cloud(self, level: FloatArray) -> FloatArray:
-        """Points of the level frame about the sensor in the frame of the cloud, (n, 3) [m]."""
-        pose = self.segmentation.pose
-        return np.asarray(level @ pose.rotation + np.array(pose.origin))
+        """Points of the frame of the edges in the frame of the cloud, (n, 3) [m]."""
+        return np.asarray(level @ self._rotation + np.array(self.segmentation.pose.origin))
 
     def _in_plane(self, x: PointArray, y: PointArray, z: PointArray) -> Places:
         """Places of points of the cloud, (n,) each, as `places` gives them."""
@@ -195,20 +216,19 @@ def ranges_of(x: PointArray, y: PointArray) -> tuple[Ranges, Ranges]:
     return nearest, farthest
 
 
-def scan_ranges(obstacles: Places, returns: Places) -> Ranges:
+def scan_ranges(obstacles: Places | Blocked, returns: Places) -> Ranges:
     """Range of the nearest of the `obstacles` in each direction [m], (DIRECTIONS,).
 
     Infinite where there are other `returns` only, NaN where there is no return at all. With
     `Blocked` also NaN behind a first return below a fall, and instead of infinite behind any fall.
     """
-    ranges, _ = ranges_of(*obstacles)
+    ranges, _ = ranges_of(*obstacles[:2])
     is_seen = np.isfinite(ranges)
     is_seen[direction_of(*returns)] = True
     ranges[~is_seen] = np.nan
     if isinstance(obstacles, Blocked):
-        ranges[(ranges > obstacles.first) | (np.isinf(ranges) & (obstacles.behind < np.inf))] = (
-            np.nan
-        )
+        is_behind = MARGIN * ranges > obstacles.first
+        ranges[is_behind | (np.isinf(ranges) & (obstacles.behind < np.inf))] = np.nan
     return ranges
 
 
@@ -226,7 +246,7 @@ def reach_of_model(surface: GroundSurface, heading: FloatArray, tolerance: float
 
 @np.errstate(over='ignore')
 def occupancy(
-    ground: Places, obstacles: Places, reach: Ranges, cell_size: float, grid_size: float
+    ground: Places, obstacles: Places | Blocked, reach: Ranges, cell_size: float, grid_size: float
 ) -> npt.NDArray[np.int8]:
     """Cells of a square about the sensor, which is the origin of the places: (n, n) by y, x.
 
@@ -239,7 +259,7 @@ def occupancy(
     state = np.full((n_cells, n_cells), UNKNOWN, dtype=np.int8)
     direction, r = _cell_centres(n_cells, cell_size)
     nearest, farthest = ranges_of(*ground)
-    until = np.minimum(np.minimum(farthest, ranges_of(*obstacles)[0]), reach)
+    until = np.minimum(np.minimum(farthest, ranges_of(*obstacles[:2])[0]), reach)
     for rows in range(0, n_cells, _ROWS):
         part = slice(rows, rows + _ROWS)
         towards = direction[part]
@@ -248,7 +268,7 @@ def occupancy(
         state[part][is_passed] = FREE
     # Places beyond the square fall into a border of one cell.
     bordered = np.pad(state, 1)
-    for places, value in ((ground, FREE), (obstacles, OCCUPIED)):
+    for places, value in ((ground, FREE), (obstacles[:2], OCCUPIED)):
         column, row = (
             np.fmin(np.fmax(along / cell_size + (0.5 * n_cells + 1.0), 0.0), n_cells + 1.0)
             for along in places

@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray
 from gp_ground_seg.core.ground_model import segment_of
+from gp_ground_seg.core.pipeline.points import angles_of, rotation
 
 SECTORS = 360
 """Sectors of azimuth, counter-clockwise from -x, that steps are looked for in."""
@@ -43,14 +44,19 @@ N_ROUGHNESS = 2.5
 BEFORE, BEHIND, WIDTH = 0.4, 1.5, 3
 """Window of the ground before a step, as a share of its range; factor from the beginning of a
 window behind it to the end; sectors on each side that the windows take in."""
-WINDOWS = 2.0, 3.0, 4.5, 6.75, 10.0
-"""Where windows about the sensor begin [m]: where it is rough, a step must be larger."""
-ON_SLOPE, MIN_DESCENT, MAX_ON_SLOPE = 0.35, 0.02, 0.2
+ON_SLOPE, MIN_DESCENT = 0.35, 0.02
 """A step is part of a descent if the ground before or behind it has at least this share of its
-slope; least descent to the next ring behind [m]; largest share of such steps in an edge."""
+slope; least descent to the next ring behind [m]."""
 NEXT_RING = 0.97
 """The slope behind a step is that to the return whose line of sight has this share of the slope of
 the line of sight at the step."""
+
+N_NEAREST, NEXT, N_FITS = 3, 1.5, 12
+"""Rings of the nearest ground that the robot stands on, factor from the range of one to that of
+the next, and rounds of fitting a plane to it."""
+WIDEST, SLOPE_NOISE, LEAST_ON_PLANE = 0.1, 0.006, 0.4
+"""Slope by which ground may be off that plane in the first and in the last round; least share of
+the ground that is off by less than twice the last."""
 
 MAX_APART, SAME_EDGE = 3, 0.12
 """Most sectors from one step of an edge to the next, and the share of its range by which the edge
@@ -66,7 +72,7 @@ LEAST_FALL, LEAST_HIDDEN = 0.02, 0.3
 FOOT = 0.01
 """Range of the ground that the robot stands on [m]."""
 MAX_SLOPE = 0.3
-"""Steepest slope that is seen to lead down from the robot."""
+"""Steepest slope that is seen to lead down from the robot; a steeper one is no way."""
 ON_LEVEL = 0.1
 """What is nearer to the level of the robot before a fall is ground, whatever its label [m]."""
 BIN, N_BINS = 0.1, 500
@@ -206,6 +212,35 @@ def find_edges(
     return edges
 
 
+def standing_level(xyz: FloatArray, height: float) -> FloatArray:
+    """Matrix (3, 3) that turns level the plane that the robot stands on.
+
+    `xyz` (N, 3) is ground about a sensor that is `height` above it [m]. The plane is the one
+    through the place below the sensor on which most of the nearest ground lies; if that is not
+    `LEAST_ON_PLANE` of it, as behind a drop, the matrix turns nothing.
+    """
+    x, y, z = xyz.T
+    r, sector = np.maximum(np.hypot(x, y), NEAREST), segment_of(x, y, SECTORS)
+    rings, nearest = [], np.zeros(SECTORS)
+    for _ in range(N_NEAREST):
+        beyond, nearest = NEXT * nearest, np.full(SECTORS, np.inf)
+        far = np.where(r > beyond[sector], r, np.inf)
+        np.minimum.at(nearest, sector, far)
+        rings.append(np.flatnonzero((far == nearest[sector]) & (far < np.inf)))
+    index = np.concatenate(rings)
+    heading, rise = np.stack([x, y])[:, index] / r[index], (z[index] + height) / r[index]
+    slope = np.zeros(2)
+    for noise in np.geomspace(WIDEST, SLOPE_NOISE, N_FITS):
+        # What is far off counts ever less: the ground on which the robot does not stand.
+        weight = 1.0 / np.hypot(noise, rise - slope @ heading)
+        slope = np.linalg.lstsq((heading * weight).T, rise * weight, rcond=None)[0]
+    on_plane = abs(rise - slope @ heading) < 2.0 * SLOPE_NOISE
+    if np.count_nonzero(on_plane) < LEAST_ON_PLANE * len(index):
+        slope = np.zeros(2)
+    up = np.array([*-slope, 1.0])
+    return rotation(*angles_of(up / np.linalg.norm(up)))
+
+
 def _hide(edges: Edges, returns: _Returns, steps: _Steps, max_step_down: float) -> None:
     """Enter what lies behind `steps`, which no slope explains, until the level is seen again."""
     z, r = returns.z, returns.r
@@ -277,16 +312,17 @@ def _steps(returns: _Returns, upper: IntArray, slope: FloatArray, max_step_down:
     *_, near = ground.window(sector[upper], begin, BEHIND * begin)
     *_, far = ground.window(sector[upper], BEHIND * begin, BEHIND**2 * begin)
     behind = np.where(slope_before == 0.0, np.maximum(near, far), np.minimum(near, far))
-    roughness = np.maximum(np.maximum(roughness, behind), ground.roughness())
+    roughness = np.maximum(roughness, behind)
     following, known = _next_ring(returns, lower, NEXT_RING)
     descent = z[lower] - z[following]
     goes_on = known & (descent >= ON_SLOPE * slope * (r[following] - r[lower]))
     goes_on &= descent > N_ROUGHNESS * roughness + MIN_DESCENT
     # The first ground that is seen leads back, up to the level of the robot.
-    _, _, seen, _ = ground.window(sector[upper], 0.95 * r[lower], BEHIND**2 * r[lower])
+    *_, seen, std = ground.window(sector[upper], 0.95 * r[lower], BEHIND**2 * r[lower])
     leads_back = returns.is_ground[lower] & (seen > -MAX_SLOPE)
-    leads_back &= z[lower] - seen * r[lower] > z[upper] - max_step_down
-    is_on_slope = np.where(is_first, leads_back, runs_down | goes_on)
+    top = z[lower] - seen * r[lower] - N_ROUGHNESS * std  # stairs have a slope, too
+    leads_back &= top > z[upper] - max_step_down
+    is_on_slope = np.where(is_first, leads_back, runs_down | goes_on) & (slope < MAX_SLOPE)
 
     fall = np.minimum(z[upper], level) - z[lower] - N_ROUGHNESS * roughness
     fall = np.where(is_first, z[upper] - z[lower], fall)
@@ -349,12 +385,6 @@ class _Ground(NamedTuple):
         terms = np.stack([np.ones(len(r)), z, z * z, r, r * r, r * z])
         return cls(key[order], np.pad(np.cumsum(terms, axis=1), ((0, 0), (1, 0))))
 
-    def roughness(self) -> float:
-        """Median of the standard deviations in windows all around the sensor [m]."""
-        begin, sector = np.meshgrid(WINDOWS, np.arange(0, SECTORS, 2 * WIDTH + 1))
-        std = self.window(sector.ravel(), begin.ravel(), BEHIND * begin.ravel())[-1]
-        return float(np.median(std[std > 0.0])) if std.any() else 0.0
-
     def window(
         self, sector: IntArray, begin: FloatArray, end: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -400,5 +430,4 @@ def _is_edge(steps: _Steps, near: FloatArray, max_step_down: float) -> bool:
         2.0 * math.pi / SECTORS * near.sum() >= MIN_WIDTH
         and n_certain >= MIN_STEPS
         and np.count_nonzero(is_strong) >= MIN_STRONG * n
-        and np.count_nonzero(steps.is_on_slope) <= MAX_ON_SLOPE * n
     )

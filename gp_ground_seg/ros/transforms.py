@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import math
+import struct
 import time
 from collections import deque
 from collections.abc import Callable
@@ -15,6 +17,7 @@ from geometry_msgs.msg import Quaternion
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.time import Time
 from sensor_msgs.msg import Imu, PointCloud2
 from std_msgs.msg import Header
@@ -29,8 +32,9 @@ from gp_ground_seg.ros.input import STEADY_CLOCK, OnCloud, seconds_of
 KEPT_JUMP = 1.0  # after a longer jump back in time, transforms are forgotten [s]
 MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]
 LONGEST_WAIT = 1.0  # the same, where it would be refused, and older messages still come [s]
-REVIEW_PERIOD = 0.005  # time between two checks of whether they have come [s]
+REVIEW_PERIOD = 0.01  # time between two checks of whether they have come [s]
 IMU_TOLERANCE = 0.05  # longest time between a cloud and its orientation [s]
+CDR_HEADER = 4  # bytes before the content of a serialised message
 DEPTH = 1000  # messages kept: those of 1 s at 1 kHz
 BEST_EFFORT = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE)
@@ -111,21 +115,21 @@ class Unattended(CallbackGroup):  # type: ignore[misc]
 
 
 class ImuListener:
-    """Keeps what ``imu`` has sent."""
+    """Keeps what ``imu`` has sent, as its bytes: of 20 messages one is read."""
+
+    newest = -math.inf  # stamp of the message that came last [s]
 
     def __init__(self, node: Node) -> None:
         self.topic: str = node.resolve_topic_name('imu')
-        self._messages: deque[tuple[float, Imu]] = deque(maxlen=DEPTH)  # with their stamps [s]
+        self._messages: deque[tuple[float, bytes]] = deque(maxlen=DEPTH)  # with their stamps [s]
 
-    def take(self, message: Imu) -> float:
+    def take(self, message: bytes) -> float:
         """Keep a message; return its stamp [s]."""
-        stamp = seconds_of(message.header.stamp)
-        self._messages.append((stamp, message))
-        return stamp
-
-    def reaches(self, stamp: float) -> bool:
-        """Return whether it has sent something as new as a cloud of that `stamp` [s]."""
-        return bool(self._messages) and self._messages[-1][0] >= stamp
+        order = '<' if message[1] & 1 else '>'
+        seconds, nanoseconds = struct.unpack_from(f'{order}iI', message, CDR_HEADER)
+        self.newest = float(seconds + 1e-9 * nanoseconds)
+        self._messages.append((self.newest, message))
+        return self.newest
 
     def at(self, stamp: float) -> tuple[Imu, float]:
         """Return the message nearest to the `stamp` of a cloud, and how far that is off [s].
@@ -134,12 +138,13 @@ class ImuListener:
         """
         if not self._messages:
             raise PointCloudError(f'no message on {self.topic}, for frame.level = imu')
-        off, found = min(((abs(t - stamp), m) for t, m in self._messages), key=itemgetter(0))
+        off, raw = min(((abs(t - stamp), m) for t, m in self._messages), key=itemgetter(0))
         if off > IMU_TOLERANCE:
             raise PointCloudError(
                 f'the nearest orientation on {self.topic} is {off:.3g} s from its stamp: '
                 f'must be within {IMU_TOLERANCE:g} s'
             )
+        found = deserialize_message(raw, Imu)
         if found.orientation_covariance[0] == -1.0:
             raise PointCloudError(
                 f'{self.topic} has no orientation (orientation_covariance[0] is -1): remap imu to '
@@ -148,11 +153,12 @@ class ImuListener:
         return found, off
 
 
-def keep_transforms(keep: Callable[[Any, str], None], message: Any) -> float:
-    """Pass what TF has sent in a `message` to `keep`; return the newest stamp in it [s]."""
-    for transform in message.transforms:
+def keep_transforms(keep: Callable[[Any, str], None], kind: Any, raw: bytes) -> float:
+    """Pass the transforms in a message of TF to `keep`; return the newest stamp in it [s]."""
+    transforms = deserialize_message(raw, kind).transforms
+    for transform in transforms:
         keep(transform, 'default_authority')
-    return max((seconds_of(t.header.stamp) for t in message.transforms), default=0.0)
+    return max((seconds_of(t.header.stamp) for t in transforms), default=0.0)
 
 
 class FrameListener:
@@ -171,7 +177,7 @@ class FrameListener:
         self._imu = self._buffer = None
         self._not_yet: Any = ()  # what TF raises
         self._too_late: Any = ()
-        sources: list[tuple[Any, str, Callable[[Any], float], QoSProfile]] = []
+        sources: list[tuple[Any, str, Callable[[bytes], float], QoSProfile]] = []
         if config.frame.level == 'imu':
             self._imu = ImuListener(node)
             sources += [(Imu, 'imu', self._imu.take, BEST_EFFORT)]  # takes from any publisher
@@ -181,8 +187,8 @@ class FrameListener:
             # and in some releases raises an error there that ends the executor. See `time_jumped`.
             self._buffer = tf2.Buffer()
             kind = find_module('tf2_msgs.msg').TFMessage
-            keep = partial(keep_transforms, self._buffer.set_transform)
-            keep_static = partial(keep_transforms, self._buffer.set_transform_static)
+            keep = partial(keep_transforms, self._buffer.set_transform, kind)
+            keep_static = partial(keep_transforms, self._buffer.set_transform_static, kind)
             sources += [(kind, '/tf', keep, RELIABLE), (kind, '/tf_static', keep_static, LATCHED)]
         group = Unattended()
         self._subscriptions = [
@@ -190,6 +196,7 @@ class FrameListener:
         ]
         self._waiting: deque[tuple[float, Header, Callable[[], None]]] = deque()
         self._held = 0.0  # how long the cloud that is used now was held [s]
+        self._found: CloudFrames | None = None  # what is known of it
         self._timer = node.create_timer(REVIEW_PERIOD, self._review, clock=STEADY_CLOCK)
         self._timer.cancel()
 
@@ -202,10 +209,12 @@ class FrameListener:
     def _take_all(self) -> None:
         """Take all that TF and IMU have sent."""
         for source in self._subscriptions:
+            newest, now = None, time.monotonic()
             with source.handle:
-                while (taken := source.handle.take_message(source.msg_type, False)) is not None:
+                while (taken := source.handle.take_message(source.msg_type, True)) is not None:
                     newest = source.callback(taken[0])
-                    self._news[source.topic_name] = newest, time.monotonic()
+            if newest is not None:
+                self._news[source.topic_name] = newest, now
 
     def _review(self) -> None:
         self._take_all()
@@ -222,11 +231,11 @@ class FrameListener:
     def _has_to_wait(self, header: Header, since: float) -> bool:
         """Return whether the pose at the stamp of a cloud, held `since` then, may still come."""
         stamp, waited = seconds_of(header.stamp), time.monotonic() - since
-        is_early = waited < MAX_WAIT
-        if is_early and self._imu is not None and not self._imu.reaches(stamp):
+        is_early, self._found = waited < MAX_WAIT, None
+        if is_early and self._imu is not None and self._imu.newest < stamp:
             return True
         try:
-            self.look_up(header, is_exact=is_early)
+            self._found = self._frames_at(header, is_exact=is_early)
         except self._not_yet:
             return True
         except (PointCloudError, ValueError):  # the cloud is refused with the reason
@@ -238,12 +247,15 @@ class FrameListener:
         soon = time.monotonic() - MAX_WAIT
         return any(newest < stamp and came > soon for newest, came in self._news.values())
 
-    def look_up(self, header: Header, is_exact: bool = False) -> CloudFrames:
-        """Return tilt and place of the sensor at the stamp of a cloud, as the parameters ask.
+    def look_up(self, header: Header) -> CloudFrames:
+        """Return tilt and place of the sensor at the stamp of the cloud that is used now.
 
-        If TF does not reach the stamp, its newest transform is used, unless it `is_exact`. Raises
-        a PointCloudError if a transform or an orientation is missing.
+        If TF does not reach the stamp, its newest transform is used. Raises a PointCloudError if a
+        transform or an orientation is missing.
         """
+        return (self._found or self._frames_at(header))._replace(waited=self._held)
+
+    def _frames_at(self, header: Header, is_exact: bool = False) -> CloudFrames:
         tilt, origin, base, ages = None, None, None, [0.0]
         frame_id, frame, stamp = header.frame_id, self.config.frame, seconds_of(header.stamp)
 
@@ -268,7 +280,7 @@ class FrameListener:
         if frame.sensor != NO_FRAME:
             way = f'from frame.sensor = {frame.sensor!r} to its frame {frame_id!r}'
             origin = _translation_of(transform(frame_id, frame.sensor, way), way)
-        return CloudFrames(tilt, origin, base, max(ages), self._held)
+        return CloudFrames(tilt, origin, base, max(ages))
 
     def _look_up(self, target: str, source: str, stamp: Time, way: str, is_exact: bool) -> Any:
         if self._buffer is None:

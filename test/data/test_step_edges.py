@@ -310,6 +310,36 @@ def test_a_drop_before_the_first_ring_is_not_free(name, depth):
     assert depth > 0.5 or (cells[:, 40:60] == costmap.FREE).mean() > 0.9
 
 
+@pytest.mark.parametrize('degrees', [-2.5, 1.5, 2.7])
+@pytest.mark.parametrize(('at', 'expected'), [(3.0, 2.5), (0.8, math.nan), (90.0, math.inf)])
+def test_pitching_hides_no_drop_and_makes_none(monkeypatch, degrees, at, expected):
+    """By less than what a scan is levelled for; also where the first ring is behind the drop."""
+    pitched = dataclasses.replace(MOUNTED['os1-64'], pitch=math.radians(degrees))
+    monkeypatch.setitem(MOUNTED, 'pitched', pitched)
+    ranges, _ = ranges_and_cells(drop(at, 0.25), 'pitched')
+    np.testing.assert_allclose(ranges[AHEAD], expected, rtol=0.5)
+
+
+def test_a_sensor_that_sees_nothing_but_lower_ground_calls_nothing_free():
+    """It looks ahead only: nothing it sees is ground or stands, and none of it is a way."""
+    sensor = MOUNTED['os1-128 low']
+    xyz = simulated(Scene('', drop(0.5, 1.2)), sensor).points[:, :3]
+    xyz = xyz[xyz[:, 0] > abs(xyz[:, 1])]
+    cloud = published(xyz, **{'sensor.height': sensor.height})
+    ranges = costmap.scan_ranges(cloud.blocked, cloud.places(np.ones(len(xyz), bool)))
+    assert np.isnan(ranges[AHEAD]).all()
+
+
+@pytest.mark.parametrize('at', [2.5, 0.8])
+def test_stairs_with_a_landing_are_no_ramp(at):
+    """Nor where the landing is the first ground that is seen."""
+    rises = [(at + 0.29 * k + 1.2 * (k > 4), -0.17 * k) for k in range(11)]
+    corners = [(x, z - down) for x, z in rises for down in (0.0, 0.17)]
+    ranges, cells = ranges_and_cells(polyline(0.0, corners), 'os1-64')
+    assert not np.isposinf(ranges[AHEAD]).any()
+    assert not (cells[:, int(10 * at) + 3 :] == costmap.FREE).any()
+
+
 @pytest.mark.parametrize('name', LOW)
 @pytest.mark.parametrize('degrees', [3.0, 6.0, 10.0])
 @pytest.mark.parametrize('at', [0.6, 2.0])
@@ -360,7 +390,7 @@ def test_edges_lie_where_the_ground_ends_in_any_frame():
         (vehicle, np.eye(3), math.cos(0.3)),
     ]
     for cloud, matrix, forward in clouds:
-        x, y = cloud.blocked
+        x, y, *_ = cloud.blocked
         x, y = (np.stack([x, y, 0.0 * x], axis=-1) @ matrix.T)[:, :2].T
         along = (x * math.cos(0.3) + y * math.sin(0.3))[np.count_nonzero(cloud.is_obstacle) :]
         assert np.median(along) == pytest.approx(5.85 + forward, abs=0.15)
