@@ -1,7 +1,7 @@
 """Compiled twin of `gp_ground_seg.core.pipeline.vertical_faces`.
 
 Of the tiles to examine, the returns are summed, the lowest and those above apart; the sums
-tell which tiles show no ground. Coordinates are rounded so that the sums are exact in any order.
+tell which tiles show no ground. Coordinates are in_units so that the sums are exact in any order.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from gp_ground_seg.core.pipeline.vertical_faces import (
     SQUARE_SCATTERS,
     SUMS,
     face_height,
+    in_units,
     is_base_occluded,
     is_beyond_edge,
     is_examined,
     is_vertical,
-    rounded,
     scatter_square,
     smooth_up_to,
 )
@@ -134,8 +134,8 @@ def _sum_returns(
         above = np.float64(z[i]) - low[_BASE]
         if above > max_height:
             continue
-        dx, dy = rounded(np.float64(x[i]) - low[_X]), rounded(np.float64(y[i]) - low[_Y])
-        dz = rounded(above)
+        dx, dy = in_units(np.float64(x[i]) - low[_X]), in_units(np.float64(y[i]) - low[_Y])
+        dz = in_units(above)
         # No branch: whether a return is one of the lowest is unpredictable.
         s = sums[np.uintp(k + np.int32(above > foot_height))]
         s[0] += 1.0
@@ -160,7 +160,7 @@ def _no_sums(tiles: Tiles, tall: CellArray, tile_size: float) -> FloatArray:
     for k in range(len(tall)):
         place = tiles.place[tall[k]]
         # About a point of the tile: about the sensor, rounding would exceed the scatter.
-        sums[2 * k, _X] = rounded((place // n_sides) * tile_size - half)
-        sums[2 * k, _Y] = rounded((place % n_sides) * tile_size - half)
+        sums[2 * k, _X] = in_units((place // n_sides) * tile_size - half)
+        sums[2 * k, _Y] = in_units((place % n_sides) * tile_size - half)
         sums[2 * k, _BASE] = tiles.extremes[tall[k], 0]
     return sums

@@ -112,8 +112,8 @@ def is_low_and_near(r: Values, z: Values, growth: GrowthConfig) -> Values:
 
 @shared
 def is_on_object(z: Values, highest: Values, sigma_n: Values) -> Values:
-    """Whether a candidate is higher than the `highest` ground and the noise of two explain."""
-    return z > highest + CLEARLY * math.sqrt(2.0) * sigma_n
+    """Whether a candidate is higher than the `highest` ground and its noise explain."""
+    return z > highest + sigma_n
 
 
 @shared

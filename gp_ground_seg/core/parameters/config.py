@@ -170,7 +170,7 @@ class LengthScaleConfig(ParameterGroup):
 class ObservationConfig(ParameterGroup):
     """Hyper-parameters of the observation process GP_z."""
 
-    sigma_f: float = advanced(0.3, (0.001, 10.0),
+    sigma_f: float = advanced(0.2, (0.001, 10.0),
         'prior standard deviation of the ground height about its mean line', 'm', 'sigma_f')
     sigma_n: float = advanced(0.05, (0.001, 5.0),
         'standard deviation of the height noise of a ground candidate', 'm', 'sigma_n')

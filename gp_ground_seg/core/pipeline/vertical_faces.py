@@ -42,9 +42,9 @@ MIN_RETURNS = 4
 """Returns that a tile needs to have an orientation."""
 FLATNESS = 1e-9
 """Scatter across a line, in parts of that along it, or of each return [m^2], which is none: as
-wide as coordinates are rounded to. What is left is rounding, and has no orientation."""
+wide as coordinates are in_units to. What is left is rounding, and has no orientation."""
 UNITS_PER_METRE = 2.0**16
-"""Coordinates are rounded to units of 15 um: squares and products within a tile, and sums of two
+"""Coordinates are in_units to units of 15 um: squares and products within a tile, and sums of two
 hundred thousand of them, are then exact, so that their order does not matter."""
 MIN_WIDTH = 0.05
 """Least standard deviation of the returns of a tile, in all directions but one, of which the
@@ -91,7 +91,8 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     row = row[used]
     # Relative to a point of the tile: about the sensor, rounding would exceed the scatter.
     x, y = (
-        scan.xyz[used, i] - rounded(place * faces.cell_size - 0.5 * n_sides * faces.cell_size)[row]
+        scan.xyz[used, i]
+        - in_units(place * faces.cell_size - 0.5 * n_sides * faces.cell_size)[row]
         for i, place in enumerate(np.divmod(tiles.place[tall], n_sides))
     )
     # Rows of the foot first, then those of the rest.
@@ -174,14 +175,14 @@ def face_height(label: LabelConfig) -> float:
 
 
 @shared
-def rounded(values: Values) -> Values:
+def in_units(values: Values) -> Values:
     """Round to units of `UNITS_PER_METRE`."""
     return np.rint(values * UNITS_PER_METRE) / UNITS_PER_METRE
 
 
 def _sums(x: FloatArray, y: FloatArray, z: FloatArray, row: IntArray, n_rows: int) -> FloatArray:
     """Add up the returns (P,) of each row, (SUMS, n_rows)."""
-    x, y, z = map(rounded, (x, y, z))
+    x, y, z = map(in_units, (x, y, z))
     terms = np.ones(len(x)), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z
     return np.array([np.bincount(row, term, n_rows) for term in terms])
 
