@@ -1,7 +1,7 @@
 """Compiled twin of `gp_ground_seg.core.pipeline.vertical_faces`.
 
 Of the tiles to examine, the returns are summed, the lowest and those above apart; the sums
-tell which tiles show no ground. Coordinates are in_units so that the sums are exact in any order.
+tell which tiles show no ground. Coordinates are rounded so that the sums are exact in any order.
 """
 
 from __future__ import annotations

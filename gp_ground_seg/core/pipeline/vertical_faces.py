@@ -42,9 +42,9 @@ MIN_RETURNS = 4
 """Returns that a tile needs to have an orientation."""
 FLATNESS = 1e-9
 """Scatter across a line, in parts of that along it, or of each return [m^2], which is none: as
-wide as coordinates are in_units to. What is left is rounding, and has no orientation."""
+wide as coordinates are rounded to. What is left is rounding, and has no orientation."""
 UNITS_PER_METRE = 2.0**16
-"""Coordinates are in_units to units of 15 um: squares and products within a tile, and sums of two
+"""Coordinates are rounded to units of 15 um: squares and products within a tile, and sums of two
 hundred thousand of them, are then exact, so that their order does not matter."""
 MIN_WIDTH = 0.05
 """Least standard deviation of the returns of a tile, in all directions but one, of which the
