@@ -95,12 +95,12 @@ def test_what_is_set_on_the_page_is_the_configuration(sequence):
         tuner = Tuner(server, list_inputs(sequence), config, names)
         assert tuner.config == config
         shown = {h.label: h for h in server.gui._gui_input_handle_from_uuid.values()}
-        shown['sensor.height = auto'].value = True
+        shown['auto'].value = True
         shown['learning.mode'].value = 'fixed'
         shown['grid.n_segments'].value = 120
         expected = {'learning.mode': 'fixed', 'grid.n_segments': 120}
         assert tuner.config == Config().replace(**expected)
-        shown['sensor.height = auto'].value = False
+        shown['auto'].value = False
         assert tuner.config == Config().replace(**expected, **{'sensor.height': 1.5})
 
 
