@@ -88,7 +88,7 @@ def test_a_slider_changes_labels_and_colours_and_a_button_writes_them(browser, s
         numbers = ['frame', *(spec.name for spec in tunable() if spec.type in (int, float))]
         index = [name for name in names if name in numbers].index('label.ground_tolerance')
         slider = browser.find_elements('css selector', '.mantine-Slider-thumb')[index]
-        webdriver.ActionChains(browser).drag_and_drop_by_offset(slider, 60, 0).perform()
+        webdriver.ActionChains(browser).drag_and_drop_by_offset(slider, 120, 0).perform()
         wait_for(browser, lambda text: re.search(r'^[1-9][\d ]* changed', text, re.MULTILINE))
         wait_for(browser, has_changed)
         shown = wait_for(browser, lambda text: re.search(r'ground\t([\d ]+)\t([\d ]+)', text))
