@@ -9,7 +9,7 @@ is no inlier need no more rows.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -100,13 +100,13 @@ def _prior_of(frame: Frame, theta: FloatArray, observation: ObservationConfig) -
 
 
 @jit(part=True)
-def _make_columns(frame: Frame, step: int, n_knots: int) -> _Columns:
-    """Room for any of every `step`-th segment, with `n_knots`."""
+def _make_columns(frame: Frame, step: int, n_knots: int, precision: Any) -> _Columns:
+    """Room for any of every `step`-th segment, with `n_knots`, of type `precision`."""
     offsets, most = frame.candidates.offsets, 0
     for m in range(0, len(offsets) - 1, step):
         most = max(most, offsets[m + 1] - offsets[m])
     width = (most + n_knots + LANES - 1) & -LANES
-    single, table = np.empty((4, width), np.float32), np.empty((4, most))
+    single, table = np.empty((4, width), precision), np.empty((4, most))
     # One by one, so that the compiler knows them to be contiguous.
     return _Columns(
         single[0],
@@ -119,7 +119,7 @@ def _make_columns(frame: Frame, step: int, n_knots: int) -> _Columns:
         table[3],
         np.zeros(most, np.bool_),
         np.empty(most, np.int64),
-        np.empty((most, width), np.float32),
+        np.empty((most, width), precision),
     )
 
 
@@ -140,7 +140,8 @@ def grow_inliers(
     none. Unless `odds` are 0, a candidate among others, or that joins in doubt, shows less: see
     `noise_among` and `noise_in_doubt`.
     """
-    columns, prior = _make_columns(frame, step, 0), _prior_of(frame, theta, observation)
+    columns = _make_columns(frame, step, 0, np.float32)
+    prior = _prior_of(frame, theta, observation)
     reach = math.exp(theta[3]) if odds > 0.0 else 0.0
     for m in range(0, len(frame.candidates.offsets) - 1, step):
         n, n_new, has_neighbours = _begin(
@@ -164,7 +165,8 @@ def regress(
 ) -> None:
     """Surface of every `step`-th segment by its inliers and `theta`, into `by_itself`."""
     knots, candidates = frame.knots, frame.candidates
-    columns = _make_columns(frame, step, len(knots))
+    # What is learned may be a noise of millimetres, which single precision would not resolve.
+    columns = _make_columns(frame, step, len(knots), np.float64)
     prior = _prior_of(frame, theta, observation)
     r, length_scale = columns.r, columns.length_scale
     for m in range(0, len(by_itself.mean), step):
@@ -346,8 +348,9 @@ def _observe(
 ) -> None:
     """Condition the columns from `near` on on candidate i: one more row of `whitened`."""
     r, length_scale, whitened = columns.r, columns.length_scale, columns.whitened
-    row, r_i, l_i, sill = whitened[n_inliers], r[i], length_scale[i], np.float32(prior.sill)
-    slope, sixth = np.float32(prior.slope), np.float32(prior.sixth)
+    row, r_i, l_i = whitened[n_inliers], r[i], length_scale[i]
+    number = row.dtype.type
+    sill, slope, sixth = number(prior.sill), number(prior.slope), number(prior.sixth)
     # Unsigned, as a signed index could count from the end.
     start, end = np.uintp(near), np.uintp(size)
     # Prior covariance of column i with the others (paper, eq. 8).
@@ -371,8 +374,8 @@ def _observe(
         k += 1
     height, variance = columns.height, columns.variance
     precision = 1.0 / (max(variance[i], 0.0) + columns.noise[i])
-    scale = np.float32(math.sqrt(precision))
-    innovation = np.float32(columns.z[i] - height[i]) * scale
+    scale = number(math.sqrt(precision))
+    innovation = number(columns.z[i] - height[i]) * scale
     for j in range(start, end):
         value = row[j] * scale
         row[j] = value
