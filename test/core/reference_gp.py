@@ -104,8 +104,7 @@ def grow(r, z, length_scale, sigmas, prior, growth):
         height, variance = posterior(*data, r, length_scale, sigmas, prior)
         residual = (z - height) / np.sqrt(variance + sigmas[1] ** 2)
         joining = ~chosen & (np.minimum(variance, (z - height) ** 2) <= growth.max_std**2)
-        joining &= residual <= growth.max_standardised_residual
-        joining &= residual >= -growth.max_standardised_depth
+        joining &= abs(residual) <= growth.max_standardised_residual
         chosen = chosen | joining
     return chosen
 

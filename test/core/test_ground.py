@@ -53,7 +53,6 @@ def draw_frame(seed, of_paper):
         'growth.max_slope': 0.0 if of_paper else float(rng.choice([0.1, 0.4])),
         'growth.max_std': float(rng.choice([0.1, 0.35, 1.0])),
         'growth.max_standardised_residual': float(rng.choice([1.0, 2.0, 8.0])),
-        'growth.max_standardised_depth': float(rng.choice([2.0, 4.0])),
         'growth.seed_range': float(rng.choice([5.5, 20.0])),
         'growth.seed_height_tolerance': 0.45 if has_sill else float(rng.choice([0.2, 0.45])),
     })  # fmt: skip

@@ -131,8 +131,7 @@ def fits(
     z: Values, height: Values, variance: Values, noise: Values, growth: GrowthConfig
 ) -> Values:
     """Whether heights are predicted well enough, and near enough, to join."""
-    residual = z - height
-    limit = choose(residual > 0.0, growth.max_standardised_residual, growth.max_standardised_depth)
+    residual, limit = z - height, growth.max_standardised_residual
     is_near = residual * residual <= limit * limit * (variance + noise)
     return (np.minimum(variance, residual * residual) <= growth.max_std * growth.max_std) & is_near
 
@@ -225,13 +224,11 @@ def grow_inliers(
 ) -> Grown:
     """Inliers of `segments`, which grow from seeds under the given hyper-parameters.
 
-    A candidate joins when the predictive standard deviation is at most
-    ``growth.max_std`` and its standardised residual is at most
-    ``growth.max_standardised_residual`` above the prediction, or
-    ``growth.max_standardised_depth`` below; or when the ground goes on to it from the inlier
+    A candidate joins when the predictive standard deviation, or the residual, is at most
+    ``growth.max_std``, and the standardised residual at most
+    ``growth.max_standardised_residual``; or when the ground carries on to it from the inlier
     before (see `carries_on`). This repeats until none joins (GP-INSAC of Chen et al. 2014; the
-    paper's outlier rejection). The gate is asymmetric because obstacles stand only above the
-    ground.
+    paper's outlier rejection).
 
     `seed` (C,) and `odds` are of `seeds`, `from_neighbours` (C,) is the evidence of the segments
     beside each.

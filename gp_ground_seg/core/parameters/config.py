@@ -176,7 +176,7 @@ class ObservationConfig(ParameterGroup):
         'standard deviation of the height noise of a ground candidate', 'm', 'sigma_n')
     slope_std: float = advanced(0.05, (0.0, 2.0),
         "prior standard deviation of the mean line's slope; 0 = a level mean")
-    slope_drift: float = advanced(0.01, (0.0, 1.0),
+    slope_drift: float = advanced(0.003, (0.0, 1.0),
         "standard deviation that the mean line's slope gains over a metre, and over others with "
         'the square root of the distance; 0 = a straight line')
 
@@ -205,13 +205,11 @@ class GrowthConfig(ParameterGroup):
         'largest height of a seed above or below the expected ground; in proportion to the height '
         'of a sensor below 1 m; larger: a ramp near the sensor can be ground, and so can a low '
         'object', 'm')
-    max_std: float = advanced(0.25, (0.001, 10.0),
-        'predictive standard deviation above which a candidate is not decided yet; in proportion '
-        'to the height of a sensor below 1 m', 'm')
+    max_std: float = advanced(0.24, (0.001, 10.0),
+        'predictive standard deviation above which a candidate is not decided yet, unless it is '
+        'as near the prediction; in proportion to the height of a sensor below 1 m', 'm')
     max_standardised_residual: float = advanced(3.0, (0.1, 50.0),
         'residual over predictive standard deviation above which a candidate is an outlier')
-    max_standardised_depth: float = advanced(5.0, (0.1, 200.0),
-        'the same for a candidate below the prediction; obstacles lie only above')
     max_slope: float = advanced(0.2, (0.0, 10.0),
         'largest slope with which the ground goes on from an inlier to a candidate that the gate '
         'rejects; 0 = the gate alone decides')
@@ -414,8 +412,7 @@ _PRESETS = (
             'surface.look_aside': (False, 'each segment has a surface of its own'),
             'observation.sigma_f': (0.5, 'about what is learned on the frames of the tables'),
             'growth.max_std': (0.6, 'not printed; chosen for segments by themselves'),
-            'growth.max_standardised_residual': (2.0, 'a gate alike above and below'),
-            'growth.max_standardised_depth': (2.0, 'a gate alike above and below'),
+            'growth.max_standardised_residual': (2.0, 'not printed; chosen as above'),
             'growth.max_slope': (0.0, 'the gate alone decides'),
             'faces.max_normal_z': (0.0, 'no faces'),
             'faces.max_foot_distance': (0.0, 'no faces'),

@@ -42,6 +42,8 @@ from gp_ground_seg.core.frame import (
 
 PRIOR_CELLS = 0.05
 """Cells that the first guess of the ground's variance counts as much as."""
+LEAST_STD = 1e-4
+"""Standard deviation of the ground that is said at least: cells agree by chance [m]."""
 PLACES = 2.0**15
 """Units that places are rounded to [1/m]: their squared distances are whole numbers below 2^53."""
 UNITS = 2.0**20
@@ -105,6 +107,7 @@ def correct_surface(
         variance[unseen] = np.maximum(variance[unseen], alone) + apart
         variance[unseen] += weight * (1.0 - weight) * difference**2
         whole[unseen] = variance[unseen] + noise[unseen]
+    variance = np.maximum(variance, LEAST_STD**2)
     # Returns lie on the ground: they depart from the surface no less than it.
     return_std = np.sqrt(np.maximum(whole, variance))
     mean, std = surface.mean + correction, np.sqrt(variance)
