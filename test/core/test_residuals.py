@@ -9,7 +9,7 @@ from conftest import hilly_scan
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.core.frame import GroundSurface, Labelled, PolarGrid
 from gp_ground_seg.core.pipeline import residuals
-from gp_ground_seg.core.pipeline.residuals import PRIOR_CELLS, correct_surface
+from gp_ground_seg.core.pipeline.residuals import LEAST_STD, PRIOR_CELLS, correct_surface
 from gp_ground_seg.lab.simulation import DRIVES, SENSORS, simulate_scan
 
 N_SEGMENTS = 7
@@ -49,6 +49,10 @@ def test_the_correction_by_hand():
     np.testing.assert_allclose(values[4, 5], unseen, atol=1e-6)
     np.testing.assert_array_equal(np.isnan(found.mean), np.isnan(mean))
     np.testing.assert_allclose(found.mean, mean + found.correction)
+    assert (found.return_std >= found.std)[np.isfinite(mean)].all()
+    # Cells that agree by chance.
+    level = Labelled(labelled.label, np.full(7, 0.02), np.full(7, 0.02))
+    assert correct_surface(surface, level, grid, noise, slope_std).std[0, 0] == LEAST_STD
 
 
 @pytest.mark.parametrize('tilt', [None, (0.05, -0.1)])

@@ -142,6 +142,13 @@ def variances_of(theta: Values) -> tuple[Values, Values]:
     return np.exp(2.0 * theta[0]), np.exp(2.0 * theta[1])
 
 
+def _variances(frame: Frame, theta: FloatArray, config: Config) -> tuple[Any, Any]:
+    """`variances_of` theta; that of the noise is more than the rounding of covariances."""
+    sill, noise = variances_of(theta)
+    farthest = frame.candidates.r.max(initial=0.0)
+    return sill, max(noise, ROUNDING * prior_variance(sill, config.observation, farthest))
+
+
 @shared
 def noise_among(n: Values, noise: Values) -> Values:
     """Variance of the noise with which one of `n` candidates close together is observed [m^2].
@@ -180,15 +187,13 @@ def posterior_covariance(
     u, knot_u = log_length_scales(frame, theta, config)
     r = np.concatenate([candidates.r[own], frame.knots[:n]])
     l = np.exp(np.concatenate([u[own], knot_u[m, :n]]))  # noqa: E741
-    sill, noise = variances_of(theta)
+    sill, noise = _variances(frame, theta, config)
     prior = paciorek(r[:, None], l[:, None], r, l, sill)
     prior += line_covariance(r[:, None], r, *line_variances(config.observation))
-    if config.label.rule == 'roughness':
-        alike = _count_near(candidates, np.exp(given_theta(config)[3]))
-        noise = noise_among(alike[own], noise)
-    given, cross = prior[: len(own), : len(own)] + np.eye(len(own)) * noise, prior[: len(own)]
-    cov = prior - cross.T @ np.linalg.solve(given, cross)
-    cov = cov[len(own) :, len(own) :]
+    reach = np.exp(given_theta(config)[3]) if config.label.rule == 'roughness' else 0.0
+    noise = np.diag(noise_among(_count_near(candidates, reach)[own], noise))
+    given, cross = prior[: len(own), : len(own)] + noise, prior[: len(own), len(own) :]
+    cov = prior[len(own) :, len(own) :] - cross.T @ np.linalg.solve(given, cross)
     scale = surface.std[m, :n] / np.sqrt(np.diag(cov))
     result: FloatArray = cov * np.outer(scale, scale)
     return result
@@ -236,9 +241,7 @@ def grow_inliers(
     candidates, given = frame.candidates, given_theta(config)
     u, _ = log_length_scales(frame, given, config)
     z = candidates.z - frame.prior_mean
-    sill, gate_noise = variances_of(given)
-    largest = prior_variance(sill, config.observation, candidates.r.max(initial=0.0))
-    gate_noise = max(gate_noise, ROUNDING * largest)
+    sill, gate_noise = _variances(frame, given, config)
     odds = odds if config.label.rule == 'roughness' else 0.0
     alike = _count_near(candidates, np.exp(given[3]) if odds > 0.0 else 0.0)
     noise = noise_among(alike, gate_noise)
@@ -409,11 +412,10 @@ def _regress(
     candidates, which = frame.candidates, np.flatnonzero(inliers.inlier)
     u, knot_u = log_length_scales(frame, theta, config)
     mean, std = np.full((2, *knot_u.shape), np.nan)
-    sill, noise = variances_of(theta)
+    sill, noise = _variances(frame, theta, config)
     line = line_variances(config.observation)
     r, z, length_scale = candidates.r, candidates.z - frame.prior_mean, np.exp(u)
-    largest = prior_variance(sill, config.observation, r.max(initial=0.0))
-    noise = noise_among(inliers.alike, max(noise, ROUNDING * largest)) + inliers.doubt
+    noise = noise_among(inliers.alike, noise) + inliers.doubt
     r, z, length_scale, noise = r[which], z[which], length_scale[which], noise[which]
     offsets = np.searchsorted(which, candidates.offsets)
     size = offsets[segments + 1] - offsets[segments]

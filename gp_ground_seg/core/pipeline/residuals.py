@@ -107,10 +107,9 @@ def correct_surface(
         variance[unseen] = np.maximum(variance[unseen], alone) + apart
         variance[unseen] += weight * (1.0 - weight) * difference**2
         whole[unseen] = variance[unseen] + noise[unseen]
-    variance = np.maximum(variance, LEAST_STD**2)
+    mean, std = surface.mean + correction, np.maximum(np.sqrt(variance), LEAST_STD)
     # Returns lie on the ground: they depart from the surface no less than it.
-    return_std = np.sqrt(np.maximum(whole, variance))
-    mean, std = surface.mean + correction, np.sqrt(variance)
+    return_std = np.maximum(np.sqrt(whole), std)
     return CorrectedSurface(surface.knots, correction, mean, std, return_std)
 
 
