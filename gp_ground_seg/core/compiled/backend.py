@@ -17,6 +17,7 @@ from gp_ground_seg.core.compiled import (
 from gp_ground_seg.core.compiled import relief as relief_
 from gp_ground_seg.core.compiled import vertical_faces as faces_
 from gp_ground_seg.core.frame import (
+    OUTSIDE,
     Candidates,
     Faces,
     FloatArray,
@@ -58,7 +59,7 @@ class NumbaBackend:
         grid = PolarGrid(cell, np.empty(n_points, dtype), geometry.edges, n_segments)
         n_places = geometry.n_sides**2
         n = min(n_points, n_places)
-        at = np.empty(n_places, np.int32)
+        at = np.full(n_places, OUTSIDE, np.int32)
         tiles = Tiles(tile, np.empty((n, 2), dtype), np.empty(n, np.int32), at)
         candidates = Candidates.buffers(n_segments * n_bins, n_segments)
         min_extent = config.lines.min_density_extent
@@ -110,9 +111,7 @@ class NumbaBackend:
         self, frame: Frame, theta: FloatArray, config: Config
     ) -> tuple[GroundSurface, FloatArray, FloatArray]:
         """Inliers, the surface, and log length-scales at the knots and at the candidates."""
-        shape = (frame.candidates.n_segments, len(frame.knots))
-        by_itself = self._surfaces(frame, config)
-        mean, std = np.empty((2, *shape))
+        found = self._surfaces(frame, config)
         evidence.estimate_surface(
             frame,
             given_theta(config),
@@ -122,12 +121,10 @@ class NumbaBackend:
             config.length_scale.model == 'latent',
             uses_neighbours_in(frame, config),
             config.label.rule == 'roughness',
-            by_itself,
-            mean,
-            std,
+            found,
         )
-        surface = GroundSurface(frame.knots, mean, std, by_itself.inlier)
-        return surface, by_itself.knot_log_length_scale, by_itself.log_length_scale
+        surface = GroundSurface(frame.knots, found.mean, found.std, found.inlier)
+        return surface, found.knot_log_length_scale, found.log_length_scale
 
     def _surfaces(self, frame: Frame, config: Config) -> ground.SegmentSurfaces:
         """Surfaces to be set, with log length-scales, to be set as well if they are latent."""
@@ -143,7 +140,7 @@ class NumbaBackend:
             np.empty(n, np.bool_),
             np.empty(n),
             np.empty(n),
-            *np.empty((2, *shape)),
+            *np.full((2, *shape), np.nan),
         )
 
     def label_points(

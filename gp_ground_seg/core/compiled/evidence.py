@@ -35,15 +35,13 @@ def estimate_surface(
     uses_neighbours: bool,
     by_roughness: bool,
     by_itself: SegmentSurfaces,
-    mean: FloatArray,
-    std: FloatArray,
 ) -> None:
-    """Do what `gp_ground_seg.core.gp.ground.estimate_surface` does, into the last three.
+    """Do what `gp_ground_seg.core.gp.ground.estimate_surface` does, into `by_itself`.
 
     `given` (T,) is `given_theta`, `is_latent` and `by_roughness` are the model of the length-scale
     and the rule of the labels by the parameters, `uses_neighbours` is `uses_neighbours_in`.
     """
-    knots, (n_segments, n_knots) = frame.knots, mean.shape
+    knots, (n_segments, n_knots) = frame.knots, by_itself.mean.shape
     own, nothing = np.empty((2, n_segments, n_knots)), np.empty((2, 0, 0))
     table = np.empty((2, n_segments, n_knots))
     u, knot_u = by_itself.log_length_scale, by_itself.knot_log_length_scale
@@ -54,18 +52,31 @@ def estimate_surface(
     odds = odds if by_roughness else 0.0
     from_neighbours = nothing
     if uses_neighbours:
-        by_itself.mean[:], by_itself.std[:] = math.nan, math.nan
         grow_inliers(frame, given, observation, growth, odds, nothing, STEP, by_itself)
         regress(frame, given, observation, STEP, by_itself)
         _find_evidence(by_itself, given, knots, observation, own, table)
         from_neighbours = table
     grow_inliers(frame, given, observation, growth, odds, from_neighbours, 1, by_itself)
-    if is_latent:
+    is_changed = False
+    for i in range(2, len(theta)):
+        is_changed |= theta[i] != given[i]
+    if is_latent and is_changed:
         latent_log_length_scales(frame, theta, 1, u, knot_u)
     regress(frame, theta, observation, 1, by_itself)
     if uses_neighbours:
         _find_evidence(by_itself, theta, knots, observation, own, table)
-    _combine(by_itself, from_neighbours, theta, knots, observation, frame.prior_mean, mean, std)
+    _combine(by_itself, from_neighbours, theta, knots, observation, frame.prior_mean)
+
+
+@jit(part=True)
+def set_low_seeds(frame: Frame, growth: GrowthConfig, seed: BoolArray) -> int:
+    """Set `seed` to all that are low and near; return the number of bins up to the last."""
+    candidates, n_bins = frame.candidates, 0
+    for c in range(len(seed)):
+        z = candidates.z[c] - frame.prior_mean
+        seed[c] = is_low_and_near(candidates.r[c], z, growth)
+        n_bins = max(n_bins, candidates.bin[c] + 1) if seed[c] else n_bins
+    return n_bins
 
 
 @jit()
@@ -82,13 +93,7 @@ def _find_seeds(
     Returns the odds of obstacles; `table` (M, K) is overwritten.
     """
     candidates, knots = frame.candidates, frame.knots
-    n_segments = len(candidates.offsets) - 1
-    n_bins = 0
-    for i in range(len(seed)):
-        z = candidates.z[i] - frame.prior_mean
-        seed[i] = is_low_and_near(candidates.r[i], z, growth)
-        if seed[i]:
-            n_bins = max(n_bins, candidates.bin[i] + 1)
+    n_segments, n_bins = len(candidates.offsets) - 1, set_low_seeds(frame, growth, seed)
     if max_slope < 0.0 or n_bins == 0:
         return ODDS
     for m in range(n_segments):
@@ -101,11 +106,10 @@ def _find_seeds(
     rise = np.empty(n_bins)
     for j in range(n_bins):
         rise[j] = max_slope * 2.0 * math.pi / n_segments * knots[j]
-    # Twice around, as the segments form a ring.
-    for m in range(1, 2 * n_segments):
-        _rise_from(table, m % n_segments, (m - 1) % n_segments, rise)
-    for m in range(2 * n_segments - 2, -1, -1):
-        _rise_from(table, m % n_segments, (m + 1) % n_segments, rise)
+    # Twice around, either way, as the segments form a ring.
+    for step in (1, -1):
+        for k in range(1, 2 * n_segments):
+            _rise_from(table, step * k % n_segments, step * (k - 1) % n_segments, rise)
     _rise_along(table, n_bins, max_slope, knots)
     n_standing = n_near = 0
     sigma_n = math.exp(theta[1])
@@ -135,14 +139,11 @@ def _rise_from(table: FloatArray, m: int, other: int, rise: FloatArray) -> None:
 def _rise_along(table: FloatArray, n_bins: int, max_slope: float, knots: FloatArray) -> None:
     """Let the ground rise outwards, then inwards."""
     # Bin by bin: along one segment each minimum would wait for the one before.
-    for j in range(1, n_bins):
-        rise = max_slope * (knots[j] - knots[j - 1])
-        for m in range(len(table)):
-            table[m, j] = min(table[m, j], table[m, j - 1] + rise)
-    for j in range(n_bins - 2, -1, -1):
-        rise = max_slope * (knots[j + 1] - knots[j])
-        for m in range(len(table)):
-            table[m, j] = min(table[m, j], table[m, j + 1] + rise)
+    for step, first, stop in ((1, 1, n_bins), (-1, n_bins - 2, -1)):
+        for j in range(first, stop, step):
+            rise = max_slope * abs(knots[j] - knots[j - step])
+            for m in range(len(table)):
+                table[m, j] = min(table[m, j], table[m, j - step] + rise)
 
 
 @jit()
@@ -206,17 +207,14 @@ def _combine(
     knots: FloatArray,
     observation: ObservationConfig,
     prior_mean: float,
-    mean: FloatArray,
-    std: FloatArray,
 ) -> None:
-    """Set `mean` and `std` to the surface of each segment and the evidence together.
+    """Make the surface of each segment that of it and the evidence together.
 
     `from_neighbours` (2, M, K) is the evidence, (2, 0, 0) if none is wanted.
     """
-    sill = math.exp(theta[0]) ** 2
+    sill, mean, std = math.exp(theta[0]) ** 2, by_itself.mean, by_itself.std
     for m in range(len(mean)):
         for j in range(len(knots)):
-            mean[m, j], std[m, j] = by_itself.mean[m, j], by_itself.std[m, j]
             if from_neighbours.shape[1] > 0 and not math.isnan(
                 by_itself.knot_log_length_scale[m, j]
             ):

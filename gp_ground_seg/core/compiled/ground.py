@@ -70,15 +70,6 @@ class _Columns(NamedTuple):
     whitened: FloatArray  # (n, size) float32, one row for each inlier
 
 
-class _Own(NamedTuple):
-    """Of the n candidates of a segment."""
-
-    r: FloatArray  # (n,) ranges [m]
-    onward: FloatArray  # (n,) see `Frame`
-    in_face: BoolArray  # (n,)
-    inlier: BoolArray  # (n,)
-
-
 class _Prior(NamedTuple):
     """Prior of the heights of all segments."""
 
@@ -144,15 +135,12 @@ def grow_inliers(
     prior = _prior_of(frame, theta, observation)
     reach = math.exp(theta[3]) if odds > 0.0 else 0.0
     for m in range(0, len(frame.candidates.offsets) - 1, step):
-        n, n_new, has_neighbours = _begin(
-            frame, m, prior.noise, reach, from_neighbours, by_itself, columns
-        )
-        if n_new > 0 or has_neighbours:
-            _grow(frame, m, n_new, prior, growth, odds, by_itself, columns)
-        first = frame.candidates.offsets[m]
-        for i in range(n):
-            certain = noise_among(by_itself.alike[first + i], prior.noise)
-            by_itself.doubt[first + i] = columns.noise[i] - certain
+        n_new = _begin(frame, m, prior.noise, reach, from_neighbours, by_itself, columns)
+        _grow(frame, m, n_new, prior, growth, odds, by_itself, columns)
+        first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
+        for c in range(first, stop):
+            certain = noise_among(by_itself.alike[c], prior.noise)
+            by_itself.doubt[c] = columns.noise[c - first] - certain
 
 
 @jit()
@@ -219,15 +207,14 @@ def _begin(
     from_neighbours: FloatArray,
     by_itself: SegmentSurfaces,
     columns: _Columns,
-) -> tuple[int, int, bool]:
+) -> int:
     """Set heights of the candidates of segment `m`, evidence there, and seeds as the new ones.
 
-    Returns how many candidates and how many seeds there are, and whether any evidence.
+    Returns how many seeds there are.
     """
     candidates, knots = frame.candidates, frame.knots
     first, stop = candidates.offsets[m], candidates.offsets[m + 1]
-    n_new, has_neighbours = 0, False
-    near = far = first
+    n_new, near, far = 0, first, first
     for i in range(stop - first):
         c = first + i
         z, r = candidates.z[c] - frame.prior_mean, candidates.r[c]
@@ -245,12 +232,11 @@ def _begin(
             precision = between_knots(r, knots[j], knots[j + 1], precisions[j], precisions[j + 1])
         columns.neighbour_height[i], columns.neighbour_precision[i] = height, precision
         columns.above[i] = contradicts(height, precision, z, noise)
-        has_neighbours |= precision > 0.0
         by_itself.inlier[c] = False
         if by_itself.seed[c] and not columns.above[i]:
             columns.new[n_new] = i
             n_new += 1
-    return stop - first, n_new, has_neighbours
+    return n_new
 
 
 @jit(part=True)
@@ -266,18 +252,14 @@ def _grow(
 ) -> None:
     """Let the new ones join, and those that then fit, until none does."""
     first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
-    own = _Own(
-        frame.candidates.r[first:stop],
-        frame.onward[first:stop],
-        frame.in_face[first:stop],
-        by_itself.inlier[first:stop],
-    )
+    inlier = by_itself.inlier[first:stop]
     for i in range(stop - first):
-        columns.r[i], columns.length_scale[i] = own.r[i], by_itself.log_length_scale[first + i]
+        columns.r[i] = frame.candidates.r[first + i]
+        columns.length_scale[i] = by_itself.log_length_scale[first + i]
     size = _lay_out(stop - first, prior, columns)
     for a in range(n_new):
         i = columns.new[a]
-        if odds > 0.0 and own.in_face[i]:
+        if odds > 0.0 and frame.in_face[first + i]:
             height, variance = _predict(i, columns)
             columns.noise[i] = noise_in_doubt(
                 columns.z[i], height, variance, columns.noise[i], True, odds
@@ -286,20 +268,24 @@ def _grow(
     while n_new > 0 or n_inliers == 0:
         for a in range(n_new):
             i = columns.new[a]
-            own.inlier[i] = True
-            while done < stop - first and own.inlier[done]:
+            inlier[i] = True
+            while done < stop - first and inlier[done]:
                 done += 1
             # The columns before are not needed any more.
             _observe(i, n_inliers, min(i, done) & -LANES, size, prior, columns)
             n_inliers += 1
-        n_new = _find_joining(own, done, n_inliers > 0, prior.noise, growth, odds, columns)
+        n_new = _find_joining(
+            frame, first, inlier, done, n_inliers > 0, prior.noise, growth, odds, columns
+        )
         if n_new == 0:
             break
 
 
 @jit(part=True)
 def _find_joining(
-    own: _Own,
+    frame: Frame,
+    first: int,
+    inlier: BoolArray,
     done: int,
     has_inliers: bool,
     noise: float,
@@ -308,9 +294,10 @@ def _find_joining(
     columns: _Columns,
 ) -> int:
     """Set the new ones to those from `done` on that now join; return their number."""
-    r, z, n_new, last = own.r, columns.z, 0, done - 1
-    for i in range(done, len(r)):
-        if own.inlier[i]:
+    r, z, n_new, last = frame.candidates.r, columns.z, 0, done - 1
+    for i in range(done, len(inlier)):
+        c = first + i
+        if inlier[i]:
             last = i
             continue
         # Before anything has joined, only the evidence of neighbours decides.
@@ -320,13 +307,13 @@ def _find_joining(
         joins = fits(z[i], height, variance, noise, growth)
         if joins and odds > 0.0:
             columns.noise[i] = noise_in_doubt(
-                z[i], height, variance, columns.noise[i], own.in_face[i], odds
+                z[i], height, variance, columns.noise[i], frame.in_face[c], odds
             )
         if not joins and last >= 0:
-            rise, distance = z[i] - z[last], r[i] - r[last]
+            rise, distance = z[i] - z[last], r[c] - r[first + last]
             walkable = is_walkable(rise, distance, growth.max_slope)
-            if walkable and not own.in_face[i] and not columns.above[i]:
-                joins = carries_on(rise, distance, own.onward[i])
+            if walkable and not frame.in_face[c] and not columns.above[i]:
+                joins = carries_on(rise, distance, frame.onward[c])
             else:
                 last = -1  # it stands on the ground, which does not go on behind it
         if joins:
@@ -359,19 +346,16 @@ def _observe(
         row[j] += line_covariance(r_i, r[j], slope, sixth)
     # Subtract the projection on the rows before, four rows at a time, so that the
     # new row is read and written once for all of them.
-    k = 0
-    while k + 4 <= n_inliers:
+    for k in range(0, n_inliers - 3, 4):
         row_0, row_1 = whitened[k], whitened[k + 1]
         row_2, row_3 = whitened[k + 2], whitened[k + 3]
         w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
         for j in range(start, end):
             row[j] -= w_0 * row_0[j] + w_1 * row_1[j] + w_2 * row_2[j] + w_3 * row_3[j]
-        k += 4
-    while k < n_inliers:
+    for k in range(n_inliers & -4, n_inliers):
         row_0, w_0 = whitened[k], whitened[k, i]
         for j in range(start, end):
             row[j] -= w_0 * row_0[j]
-        k += 1
     height, variance = columns.height, columns.variance
     precision = 1.0 / (max(variance[i], 0.0) + columns.noise[i])
     scale = number(math.sqrt(precision))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from gp_ground_seg.core.compiled.evidence import set_low_seeds
 from gp_ground_seg.core.compiled.ground import SegmentSurfaces, grow_inliers
 from gp_ground_seg.core.compiled.latent import latent_log_length_scales
 from gp_ground_seg.core.compiled.likelihood import log_likelihood
 from gp_ground_seg.core.frame import FloatArray, Frame, Inliers
-from gp_ground_seg.core.gp.evidence import is_low_and_near
 from gp_ground_seg.core.gp.learning import (
     ThetaSpace,
     maximise,
@@ -56,21 +56,11 @@ def learn_frame(
     if is_latent:
         at_knots = by_itself.knot_log_length_scale
         latent_log_length_scales(frame, theta, step, by_itself.log_length_scale, at_knots)
-    _set_seeds(frame, growth, step, by_itself)
+    set_low_seeds(frame, growth, by_itself.seed)
     grow_inliers(frame, theta, observation, growth, odds, nothing, step, by_itself)
     inliers = _take_inliers(frame, step, has_latent, by_itself)
     most = learning.max_evaluations
     return maximise(space, inliers, observation, is_map, most, theta, outcome)
-
-
-@jit(part=True)
-def _set_seeds(frame: Frame, growth: GrowthConfig, step: int, by_itself: SegmentSurfaces) -> None:
-    """Set the seeds of every `step`-th segment: without neighbours, all that are low."""
-    candidates = frame.candidates
-    for m in range(0, len(candidates.offsets) - 1, step):
-        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
-            z = candidates.z[c] - frame.prior_mean
-            by_itself.seed[c] = is_low_and_near(candidates.r[c], z, growth)
 
 
 @jit(part=True)

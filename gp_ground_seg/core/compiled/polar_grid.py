@@ -43,7 +43,7 @@ def build_grid(
     extremes. Returns the numbers of tiles and of candidates, which have room for more; see
     `_take_candidates`.
     """
-    cell, r, tile, at = grid.cell, grid.r, tiles.tile, tiles.at
+    cell, r, tile = grid.cell, grid.r, tiles.tile
     n_cells, n_tiles = (len(candidates.offsets) - 1) * (len(geometry.edges) - 1), 0
     # Of each cell: height of the lowest point, its range, height of the highest point, x and y of
     # the lowest point; number of points, and tile of the lowest. The last is for those in no cell.
@@ -52,8 +52,6 @@ def build_grid(
         extremes[k, 0] = extremes[k, 1] = np.inf
         extremes[k, 2] = -np.inf
         numbers[k, 0], numbers[k, 1] = 0, OUTSIDE
-    for k in range(len(at)):
-        at[k] = OUTSIDE
     range_entry, place = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
     key, key_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, np.int32)
     for first in range(0, len(r), BLOCK):
@@ -208,15 +206,10 @@ def _resolve_lowest(
         if cell[i] < 0:
             continue
         k = np.uintp(cell[i])
-        r_i, nearest = r[i], extremes[k, 1]
-        is_first = r_i < nearest
-        if r_i == nearest:
-            is_first = tile_places[tile[i]] < tile_places[numbers[k, 1]]
-            if tile[i] == numbers[k, 1]:
-                is_first = x[i] < extremes[k, 3]
-                is_first |= x[i] == extremes[k, 3] and y[i] < extremes[k, 4]
-        if is_first:
-            extremes[k, 1], numbers[k, 1] = r_i, tile[i]
+        own = r[i], tile_places[tile[i]], x[i], y[i]
+        place = tile_places[max(numbers[k, 1], 0)]
+        if own < (extremes[k, 1], place, extremes[k, 3], extremes[k, 4]):
+            extremes[k, 1], numbers[k, 1] = r[i], tile[i]
             extremes[k, 3], extremes[k, 4] = x[i], y[i]
 
 
