@@ -156,7 +156,7 @@ def _last_first(block, progress):
 
 
 def test_results_are_those_of_one_process_also_if_a_worker_dies(scheduler, tmp_path, caplog):
-    with cluster.open_runner(None, scheduler, cluster._NO_BAR) as workers:
+    with cluster.open_runner(None, scheduler, cluster.HERE.bar) as workers:
         assert workers.n_workers == 2
         found = workers.run(partial(_die_once, tmp_path / 'died'), range(40))
         assert found == [sum(range(k, k + 10)) for k in range(0, 40, 10)]
@@ -173,7 +173,7 @@ def test_results_are_those_of_one_process_also_if_a_worker_dies(scheduler, tmp_p
 
 def test_workers_speak_tls_and_are_seen_on_this_machine_only():
     spawning = dask.config.set({'distributed.worker.multiprocessing-method': 'spawn'})
-    with spawning, cluster.open_runner(1, None, cluster._NO_BAR) as runner:
+    with spawning, cluster.open_runner(1, None, cluster.HERE.bar) as runner:
         assert runner.run(_last_first, range(1, 3)) == [1, 2]
         family = [psutil.Process(), *psutil.Process().children()]
         sockets = [socket for process in family for socket in process.net_connections()]

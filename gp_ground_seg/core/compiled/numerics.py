@@ -114,10 +114,13 @@ def factorise(a: FloatArray, n: int) -> bool:
 
 
 @jit()
-def invert_triangle(factor: FloatArray, n: int, whitened: FloatArray) -> None:
-    """Set the lower triangle of `whitened` to ``U^-T``."""
-    one = np.uintp(1)
-    for i in range(np.uintp(n)):
+def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray) -> None:
+    """Inverse of ``U^T U``, both triangles, in `inverse`.
+
+    `whitened` is working space; its lower triangle becomes ``U^-T``.
+    """
+    stop, one = np.uintp(n), np.uintp(1)
+    for i in range(stop):
         for j in range(i + one):
             whitened[i, j] = 0.0
         for k in range(i):
@@ -128,16 +131,6 @@ def invert_triangle(factor: FloatArray, n: int, whitened: FloatArray) -> None:
         for j in range(i):
             whitened[i, j] *= scale
         whitened[i, i] = scale
-
-
-@jit()
-def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray) -> None:
-    """Inverse of ``U^T U``, both triangles, in `inverse`.
-
-    `whitened` is working space; its lower triangle becomes ``U^-T``.
-    """
-    stop, one = np.uintp(n), np.uintp(1)
-    invert_triangle(factor, n, whitened)
     for i in range(stop):
         for j in range(i + one):
             inverse[i, j] = 0.0
