@@ -49,6 +49,7 @@ def test_the_correction_by_hand():
     np.testing.assert_allclose(values[4, 5], unseen, atol=1e-6)
     np.testing.assert_array_equal(np.isnan(found.mean), np.isnan(mean))
     np.testing.assert_allclose(found.mean, mean + found.correction)
+    assert (found.return_std >= found.std)[np.isfinite(mean)].all()
 
 
 @pytest.mark.parametrize('tilt', [None, (0.05, -0.1)])
