@@ -28,7 +28,8 @@ SECONDS = 90
 # Plain Python warns where hashes of the compiled loops overflow.
 OPTIONS = ['-xq', '-p', 'no:cacheprovider', '-m', 'not slow', '--timeout=60']
 OPTIONS += ['-W', 'ignore:overflow encountered', '-W', 'ignore:Module already imported']
-SAME = ('scope', 'old', 'new')  # of a statement that was moved
+NAMES = 'scope', 'first', 'last', 'kind', 'old', 'new'
+SAME = 'scope', 'old', 'new'  # of a statement that was moved
 PAIRS = (ast.Lt, ast.Gt), (ast.LtE, ast.GtE), (ast.Eq, ast.NotEq), (ast.Is, ast.IsNot)
 PAIRS += (ast.In, ast.NotIn), (ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.And, ast.Or)
 TURNED = {a: b for pair in PAIRS for a, b in (pair, pair[::-1])}
@@ -65,50 +66,38 @@ def own_nodes(node):
                 yield from own_nodes(child)
 
 
-def edits(path):
-    """Each fault of a file; `nth` counts equal ones of a function."""
-    seen = Counter()
+def faults_in(node):
+    """Kind, old and new text of each fault of a statement."""
+    old = ast.unparse(node)
+    if isinstance(node, ast.Raise) or old.startswith('LOGGER'):
+        return  # words
+    is_call = isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
+    if is_call or isinstance(node, ast.AugAssign):
+        yield 'pass', old, 'pass'
+    for k, part in enumerate(own_nodes(node)):
+        other = copy.deepcopy(node)
+        if spoil([*own_nodes(other)][k]) and ast.unparse(other) != old:
+            yield type(part).__name__, old, ast.unparse(other)
 
-    def of_statement(node):
-        text = ast.unparse(node)
-        if isinstance(node, ast.Raise) or text.startswith('LOGGER'):
-            return  # words
-        is_call = isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
-        if is_call or isinstance(node, ast.AugAssign):
-            yield 'pass', text, 'pass'
-        for k, part in enumerate(own_nodes(node)):
-            other = copy.deepcopy(node)
-            if spoil([*own_nodes(other)][k]):
-                yield type(part).__name__, text, ast.unparse(other)
 
-    def visit(node, scope):
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            scope += '.' + node.name
-        elif isinstance(node, ast.stmt):
-            for kind, old, new in of_statement(node):
-                fault = {
-                    'file': str(path.relative_to(TREE)),
-                    'kind': kind,
-                    'scope': scope,
-                    'first': node.lineno,
-                    'last': node.end_lineno,
-                    'old': old,
-                    'new': new,
-                }
-                seen[same := tuple(fault[key] for key in SAME)] += 1
-                if old != new:
-                    yield {**fault, 'nth': seen[same]}
-        for child in ast.iter_child_nodes(node):
-            if isinstance(child, ast.stmt | ast.match_case | ast.ExceptHandler):
-                yield from visit(child, scope)
-
-    return visit(ast.parse(path.read_text(encoding='utf-8')), '')
+def edits(node, scope=''):
+    """Each fault of a syntax tree."""
+    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        scope += '.' + node.name
+    elif isinstance(node, ast.stmt):
+        place = scope, node.lineno, node.end_lineno
+        for fault in faults_in(node):
+            yield dict(zip(NAMES, (*place, *fault), strict=True))
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.stmt | ast.match_case | ast.ExceptHandler):
+            yield from edits(child, scope)
 
 
 def faults_of(room, name='*.py'):
     """Each fault of a room, or of its files of a name."""
     paths = sorted((TREE / 'gp_ground_seg' / room).rglob(name))
-    return [fault for path in paths for fault in edits(path)]
+    trees = {str(path.relative_to(TREE)): ast.parse(path.read_text()) for path in paths}
+    return [{'file': file, **fault} for file, tree in trees.items() for fault in edits(tree)]
 
 
 def draw(room, name):
@@ -129,7 +118,7 @@ def find(fault, faults):
     for keys in (('file', *SAME), SAME):
         found = [one for one in faults if all(one[key] == fault[key] for key in keys)]
         if found and (len(found) == 1 or 'file' in keys):
-            return found[min(fault['nth'], len(found)) - 1]
+            return found[0]
     return None
 
 

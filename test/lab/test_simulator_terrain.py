@@ -104,18 +104,6 @@ def test_landform_heights(terrain, u, expected):
     np.testing.assert_allclose(terrain.height(np.array(u), np.zeros(len(u))), expected, atol=1e-12)
 
 
-def test_waves_have_the_rms_asked_for_and_rubble_starts_where_the_road_ends():
-    ground = landforms.rough(np.random.default_rng(9), 0.1, (1.0, 8.0))
-    x, y = np.random.default_rng(10).uniform(-2000.0, 2000.0, (2, 50_000))
-    assert np.std(ground.height(x, y)) == pytest.approx(0.1, rel=0.03)
-    rubble = landforms.smooth_then_rough(np.random.default_rng(11), 20.0, 5.0)
-    x, y = np.random.default_rng(12).uniform(-50.0, 20.0, (2, 1000))
-    assert not rubble.height(x, y).any() and np.std(rubble.height(x + 120.0, y)) > 0.1
-    total = landforms.Sum((ground, rubble)).height(x + 120.0, y)
-    parts = (part.height(x + 120.0, y) for part in (ground, rubble))
-    np.testing.assert_allclose(total, sum(parts))
-
-
 def inside(solid, points):
     """Obvious twin of `Solid.entry`: whether points lie in the solid."""
     x, y = points[..., 0] - solid.x, points[..., 1] - solid.y
