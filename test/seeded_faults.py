@@ -31,7 +31,12 @@ OPTIONS += ['-W', 'ignore:overflow encountered', '-W', 'ignore:Module already im
 NAMES = 'scope', 'first', 'last', 'kind', 'old', 'new'
 SAME = 'scope', 'old', 'new'  # of a statement that was moved
 PAIRS = (ast.Lt, ast.Gt), (ast.LtE, ast.GtE), (ast.Eq, ast.NotEq), (ast.Is, ast.IsNot)
-PAIRS += (ast.In, ast.NotIn), (ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.And, ast.Or)
+PAIRS += (
+    (ast.In, ast.NotIn),
+    (ast.Add, ast.Sub),
+    (ast.Mult, ast.Div),
+    (ast.And, ast.Or),
+)  # codespell:ignore notin
 TURNED = {a: b for pair in PAIRS for a, b in (pair, pair[::-1])}
 
 
@@ -134,10 +139,9 @@ def run(fault, tests, folder):
     """Return the test that finds the fault; None if none does, 'undecided' at the time limit."""
     path = folder / fault['file']
     source = path.read_text(encoding='utf-8')
-    lines = source.splitlines(keepends=True)
-    first, last = fault['first'] - 1, fault['last']
-    margin, other = re.match('( *)(el(?=if )|)', lines[first]).groups()
-    lines[first:last] = textwrap.indent(other + fault['new'], margin) + '\n'
+    lines, place = source.splitlines(keepends=True), slice(fault['first'] - 1, fault['last'])
+    margin, other = re.match('( *)(el(?=if )|)', lines[place][0]).groups()
+    lines[place] = textwrap.indent(other + fault['new'], margin) + '\n'
     path.write_text(''.join(lines), encoding='utf-8')
     words = [sys.executable, '-m', 'pytest', *OPTIONS, *tests]
     environment = {**os.environ, 'PYTHONPATH': str(folder), 'PYTHONDONTWRITEBYTECODE': '1'}
