@@ -31,12 +31,7 @@ OPTIONS += ['-W', 'ignore:overflow encountered', '-W', 'ignore:Module already im
 NAMES = 'scope', 'first', 'last', 'kind', 'old', 'new'
 SAME = 'scope', 'old', 'new'  # of a statement that was moved
 PAIRS = (ast.Lt, ast.Gt), (ast.LtE, ast.GtE), (ast.Eq, ast.NotEq), (ast.Is, ast.IsNot)
-PAIRS += (
-    (ast.In, ast.NotIn),
-    (ast.Add, ast.Sub),
-    (ast.Mult, ast.Div),
-    (ast.And, ast.Or),
-)  # codespell:ignore notin
+PAIRS += (ast.In, ast.NotIn), (ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.And, ast.Or)
 TURNED = {a: b for pair in PAIRS for a, b in (pair, pair[::-1])}
 
 
