@@ -40,7 +40,7 @@ class GroundModel:
     #: (M, K) distance over which the height of the ground is similar [m]; NaN in segments without
     #: a ground candidate of their own
     length_scale: FloatArray
-    roll: float = 0.0  #: tilt of the frame of the scan: angles that make it level [rad]
+    roll: float = 0.0  #: tilt of the frame of the scan (angles that make it level) [rad]
     pitch: float = 0.0  #: the same [rad]
     origin: Direction = (0.0, 0.0, 0.0)  #: place of the sensor in the frame of the scan [m]
 

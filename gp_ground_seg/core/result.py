@@ -55,8 +55,8 @@ class FitReport:
     status: str
     n_evaluations: int  #: evaluations of the objective
     objective: float  #: objective per inlier at the end; NaN when nothing was learned
-    #: hyper-parameters used: sigma_f, sigma_n [m], sigma_f_bar, sigma_l_bar [m], sigma_n_bar, and
-    #: the factor on the length-scales that the lines suggest, or one for each class of lines
+    #: hyper-parameters used (sigma_f, sigma_n [m], sigma_f_bar, sigma_l_bar [m], sigma_n_bar, and
+    #: the factor on the length-scales that the lines suggest, or one for each class of lines)
     theta: dict[str, float]
     at_bound: tuple[str, ...]  #: those that ended at a bound
     n_segments: int  #: segments with a ground model
@@ -133,7 +133,7 @@ class Segmentation:
     pose: SensorPose
     relief: Relief  #: height of the land in plan, over which those of `frame` and `surface` are
     z: PointArray  #: (N,) height of each point in the sensor frame [m]
-    config: Config  #: parameters of the frame: those given, with narrower gates for a low sensor
+    config: Config  #: parameters of the frame (those given, with narrower gates for a low sensor)
 
     @property
     def theta(self) -> FloatArray:
