@@ -33,7 +33,7 @@ $(VENV)/.python:
 
 $(VENV)/.ros: setup.py $(VENV)/.python
 	@echo 'Installing gp_ground_seg, numba, matplotlib and ROS 2 Jazzy from PyPI into $(VENV) ...'
-	@$(BIN)/python scripts/install_with_progress.py 180 -e '.[ros]'
+	@$(BIN)/python scripts/install_with_progress.py 211 -e '.[ros]'
 	@touch $@
 
 $(VENV)/.dev: setup.py $(VENV)/.ros

@@ -102,6 +102,11 @@ def digest(body: str) -> str:
     return hashlib.sha256(body.encode()).hexdigest()[:8]
 
 
+def typed(command: str) -> str:
+    """Command as a reader types it."""
+    return f'{"python" if words_of(command, "")[0].endswith(".py") else "gp-ground-seg"} {command}'
+
+
 def words_of(command: str, kitti: str) -> list[str]:
     """Words of a command as they are run."""
     words = [word.replace(ROOT, kitti) for word in shlex.split(command)]
@@ -164,7 +169,7 @@ def body_of(figure: Figure, output: str, commit: str, *, is_last: bool = True) -
         output = f'```text\n{output}\n```'
     if not is_last:
         output = output.partition(f'\n\n{MACHINE}')[0]
-    return f'`gp-ground-seg {figure.command}` (commit {commit})\n\n{output}\n\n'
+    return f'`{typed(figure.command)}` (commit {commit})\n\n{output}\n\n'
 
 
 def read_samples() -> dict[str, list[str]]:
@@ -190,7 +195,7 @@ def run_all(commands: list[str], kitti: str, folder: Path) -> dict[str, str]:
     started = time.monotonic()
     for k, command in enumerate(commands, 1):
         seconds = time.monotonic() - started
-        print(f'[{k}/{len(commands)}, {seconds:.0f} s] gp-ground-seg {command}', flush=True)
+        print(f'[{k}/{len(commands)}, {seconds:.0f} s] {typed(command)}', flush=True)
         try:
             outputs[command] = run(command, kitti, folder)
         except subprocess.CalledProcessError as error:

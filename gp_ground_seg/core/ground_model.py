@@ -28,34 +28,21 @@ def segment_of(x: PointArray, y: PointArray, n_segments: int) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class GroundModel:
-    """Ground height over range in each angular segment, about the sensor's vertical.
+    """Ground height over range in each angular segment, about the sensor's vertical."""
 
-    Attributes
-    ----------
-    knots : (K,) float64
-        Horizontal ranges, near to far [m].
-    height : (M, K) float64
-        Height of the ground over the sensor at the knots of each segment [m], so mostly
-        negative; NaN where there is no model. Segments go counter-clockwise from -x.
-    std : (M, K) float64
-        Standard deviation of the height [m], as in ``Segmentation.ground_std``; NaN where there
-        is no model.
-    length_scale : (M, K) float64
-        Distance over which the height of the ground is similar [m]; NaN in segments without
-        a ground candidate of their own.
-    roll, pitch : float
-        Tilt of the frame of the scan: angles that make it level [rad].
-    origin : tuple of float
-        Place of the sensor in the frame of the scan [m].
-    """
-
-    knots: FloatArray
+    knots: FloatArray  #: (K,) horizontal ranges, near to far [m]
+    #: (M, K) height of the ground over the sensor at the knots of each segment [m], so mostly
+    #: negative; NaN where there is no model. Segments go counter-clockwise from -x.
     height: FloatArray
+    #: (M, K) standard deviation of the height [m], as in ``Segmentation.ground_std``; NaN where
+    #: there is no model
     std: FloatArray
+    #: (M, K) distance over which the height of the ground is similar [m]; NaN in segments without
+    #: a ground candidate of their own
     length_scale: FloatArray
-    roll: float = 0.0
-    pitch: float = 0.0
-    origin: Direction = (0.0, 0.0, 0.0)
+    roll: float = 0.0  #: tilt of the frame of the scan (angles that make it level) [rad]
+    pitch: float = 0.0  #: the same [rad]
+    origin: Direction = (0.0, 0.0, 0.0)  #: place of the sensor in the frame of the scan [m]
 
     @classmethod
     @usual_errors()

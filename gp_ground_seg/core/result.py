@@ -48,45 +48,23 @@ def cached_property(compute: Callable[[Any], _Value]) -> functools.cached_proper
 
 @dataclass(frozen=True)
 class FitReport:
-    """Outcome of the learning and of the inlier growth.
+    """Outcome of the learning and of the inlier growth."""
 
-    Attributes
-    ----------
-    mode : str
-        ``learning.mode`` of the frame.
-    status : str
-        ``converged``, ``budget`` or ``failed``; ``kept`` when nothing was learned on this frame.
-    n_evaluations : int
-        Evaluations of the objective.
-    objective : float
-        Objective per inlier at the end; NaN when nothing was learned.
-    theta : dict of str to float
-        Hyper-parameters used: sigma_f, sigma_n [m], sigma_f_bar, sigma_l_bar [m],
-        sigma_n_bar, and the factor on the length-scales that the lines suggest, or one for
-        each class of lines.
-    at_bound : tuple of str
-        Those that ended at a bound.
-    n_segments : int
-        Segments with a ground model.
-    n_candidates, n_inliers, n_lines, n_pseudo_inputs : int
-        Ground candidates, those the surface rests on, lines among them, and
-        pseudo-inputs of the latent process.
-    backend : str
-        ``numba`` or ``numpy``.
-    """
-
-    mode: str
+    mode: str  #: ``learning.mode`` of the frame
+    #: ``converged``, ``budget`` or ``failed``; ``kept`` when nothing was learned on this frame
     status: str
-    n_evaluations: int
-    objective: float
+    n_evaluations: int  #: evaluations of the objective
+    objective: float  #: objective per inlier at the end; NaN when nothing was learned
+    #: hyper-parameters used (sigma_f, sigma_n [m], sigma_f_bar, sigma_l_bar [m], sigma_n_bar, and
+    #: the factor on the length-scales that the lines suggest, or one for each class of lines)
     theta: dict[str, float]
-    at_bound: tuple[str, ...]
-    n_segments: int
-    n_candidates: int
-    n_inliers: int
-    n_lines: int
-    n_pseudo_inputs: int
-    backend: str
+    at_bound: tuple[str, ...]  #: those that ended at a bound
+    n_segments: int  #: segments with a ground model
+    n_candidates: int  #: ground candidates
+    n_inliers: int  #: those the surface rests on
+    n_lines: int  #: lines among the candidates
+    n_pseudo_inputs: int  #: pseudo-inputs of the latent process
+    backend: str  #: ``numba`` or ``numpy``
 
     @classmethod
     def of(cls, frame: Segmentation) -> FitReport:
@@ -133,48 +111,29 @@ class Segment(NamedTuple):
 class Segmentation:
     """A segmented scan; per-point arrays are in input order.
 
-    Two are equal only if they are the same object: compare their arrays.
-
-    Attributes
-    ----------
-    labelled : Labelled
-        Labels and what they follow from, heights over `surface` among it; `label` and
-        `margin` are taken from it.
-    timings : dict of str to float
-        Seconds per stage, and ``total``.
-    learned : Learned
-        Outcome of the learning; `fit` sums it up.
-    backend : str
-        ``numba`` or ``numpy``.
-    grid, frame, surface
-        Intermediate results, for plots and diagnostics; in the level frame. `surface` is the
-        process's own, which the labels follow from; `corrected` is what users are given.
-    log_length_scale : (M, K) float64
-        Log length-scale at the K knots of the surface [log m]; NaN in segments
-        without candidates.
-    pose : SensorPose
-        Height and tilt of the sensor that were used, and what the scan says of them;
-        ``pose.level(xyz)`` gives points in the level frame.
-    relief : Relief
-        Height of the land in plan, over which the heights of `frame` and `surface` are.
-    z : (N,) float32 or float64
-        Height of each point in the sensor frame [m].
-    config : Config
-        Parameters of the frame: those given, with narrower gates for a low sensor.
+    Two are equal only if they are the same object: compare their arrays. `grid`, `frame` and
+    `surface` are intermediate results, for plots and diagnostics, in the level frame.
     """
 
+    #: labels and what they follow from, heights over `surface` among it; `label` and `margin` are
+    #: taken from it
     labelled: Labelled
-    timings: dict[str, float]
-    learned: Learned
-    backend: str
-    grid: PolarGrid
-    frame: Frame
+    timings: dict[str, float]  #: seconds per stage, and ``total``
+    learned: Learned  #: outcome of the learning; `fit` sums it up
+    backend: str  #: ``numba`` or ``numpy``
+    grid: PolarGrid  #: cell of each point
+    frame: Frame  #: what the processes are fitted to
+    #: the process's own surface, which the labels follow from; `corrected` is what users are given
     surface: GroundSurface
+    #: (M, K) log length-scale at the K knots of the surface [log m]; NaN in segments without
+    #: candidates
     log_length_scale: FloatArray
+    #: height and tilt of the sensor that were used, and what the scan says of them;
+    #: ``pose.level(xyz)`` gives points in the level frame
     pose: SensorPose
-    relief: Relief
-    z: PointArray
-    config: Config
+    relief: Relief  #: height of the land in plan, over which those of `frame` and `surface` are
+    z: PointArray  #: (N,) height of each point in the sensor frame [m]
+    config: Config  #: parameters of the frame (those given, with narrower gates for a low sensor)
 
     @property
     def theta(self) -> FloatArray:

@@ -201,11 +201,10 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     """
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     scores, models = score_variants(items, variants, [InterpolationMethod(config)], runner)
-    known = [row for row in PAIRS if {*row[2:]} <= {*scores.methods}]
-    pairs = [(ours, other) for _, _, ours, other in known]
+    pairs = [(ours, other) for _, _, ours, other in PAIRS]
     rows = frame_of({
-        'pair': [title for title, *_ in known],
-        'theta': [how for _, how, *_ in known],
+        'pair': [title for title, *_ in PAIRS],
+        'theta': [how for _, how, *_ in PAIRS],
         **_differences(scores, 'iou', pairs, 'iou_'),
         **_differences(scores, 'rmse', pairs, 'rmse_'),
     })  # fmt: skip
@@ -466,34 +465,36 @@ def _rows(
 ) -> list[dict[str, Any]]:
     """Rows of a frame, by title of the column."""
     scan = load_kitti(frame)
-    z = scan.points[:, 2].astype(np.float64)
     scores = score_methods([scan] * N_REPEATS, methods, lambda scan: scan, runner=runner)
     seconds = scores.scans.groupby('method')['seconds'].median()
     # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
     common = methods[0].last
-    candidates = common.candidates
+    candidates, grid = common.candidates, common.grid
+    # In double precision, which those of the labels are not in.
+    x, y, z = common.pose.level(scan.points[:, :3]).T.astype(np.float64)
     # A candidate is the point at the same place.
-    x, y, _ = common.pose.level(scan.points[:, :3]).T
-    modelled = scan.is_ground & (common.grid.bin != OUTSIDE)
+    modelled = scan.is_ground & (grid.bin != OUTSIDE)
+    modelled &= ~np.isin(x + 1j * y, candidates.x + 1j * candidates.y)
     rows = []
     for segment in segments:
         part = slice(*candidates.offsets[segment : segment + 2])
-        held_out = modelled & (common.grid.segment == segment)
-        held_out &= ~np.isin(x + 1j * y, candidates.x[part] + 1j * candidates.y[part])
+        held_out = np.flatnonzero(modelled & (grid.segment == segment))
         row: dict[str, Any] = {
             'segment': f'{frame.sequence}/{frame.index}:{segment}',
             'n_PG': int(part.stop - part.start),
             'n_L': int(np.diff(common.pseudo.offsets)[segment]),
             **dict(zip(VARIANCES, np.exp(2.0 * common.theta).tolist(), strict=False)),
-            'held out n': int(held_out.sum()),
+            'held out n': len(held_out),
         }
         for k, method in enumerate(methods):
-            result, surface = method.last, method.last.surface
-            r, at = result.candidates.r[part], surface.inlier[part]
-            estimate = np.interp(r[at], surface.knots, surface.mean[segment])
-            row[SMSE[k]] = _smse(result.candidates.z[part][at], estimate)
             # Of the process itself, as in the paper; not the corrected surface.
-            row[HELD_OUT[k]] = _smse(z[held_out], z[held_out] - result.labelled.height[held_out])
+            result, surface = method.last, method.last.surface
+            at = np.flatnonzero(surface.inlier[part]) + part.start
+            known = surface.knots, surface.mean[segment]
+            row[SMSE[k]] = _smse(candidates.z[at], np.interp(candidates.r[at], *known))
+            relief = result.relief.at(x[held_out], y[held_out])
+            ground = np.add(np.interp(grid.r[held_out], *known), relief)
+            row[HELD_OUT[k]] = _smse(z[held_out], ground)
             row[TIMES[k]] = seconds[method.name]
         rows.append(row)
     return rows

@@ -11,6 +11,7 @@ from gp_ground_seg.core.compiled import likelihood as compiled
 from gp_ground_seg.core.frame import Inliers
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.core.gp.likelihood import log_likelihood
+from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import ObservationConfig
 from gp_ground_seg.core.parameters.schema import numbers_of
 
@@ -21,9 +22,12 @@ LEVEL = numbers_of(ObservationConfig(slope_std=0.0, slope_drift=0.0))
 TYPICAL = np.log([0.3, 0.05, 0.9, 3.0, 0.25, *FACTORS])
 
 
+set_likelihood = jit(part=True)(compiled.log_likelihood)
+
+
 def compiled_log_likelihood(theta, *arguments):
     gradient = np.empty(len(theta))
-    return compiled.log_likelihood(theta, *arguments, gradient), gradient
+    return set_likelihood(theta, *arguments, gradient), gradient
 
 
 @pytest.fixture(params=[log_likelihood, compiled_log_likelihood], ids=['numpy', 'numba'])

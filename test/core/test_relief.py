@@ -135,6 +135,7 @@ def test_no_relief_is_what_cannot_be_climbed(backend, name, share):
     relief, over = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
     assert relief.is_level
     assert over is candidates
+    assert (relief.at(np.array([0.0, 9.0]), np.array([0.0, 3.0])) == 0.0).all()
 
 
 def test_without_ground_near_the_sensor_there_is_no_relief(backend):

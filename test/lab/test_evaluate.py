@@ -27,7 +27,6 @@ from gp_ground_seg.lab.scoring.evaluate import (
     STAGE,
     OurMethod,
     sums,
-    with_all,
 )
 from gp_ground_seg.lab.scoring.metrics import COUNTS, label_ratios
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
@@ -55,9 +54,6 @@ def test_pooling_sums_counts_and_does_not_average_ratios():
     )
     assert (scores.methods, scores.sequences) == (['x', 'y'], ['08', '00'])
     assert MEASURES['iou'](sums(scores.scans)).tolist() == [90 / 101, 0.0]
-    by_sequence = sums(with_all(scores.scans), 'sequence')
-    assert by_sequence.loc['y'].index.tolist() == ['08', '00', 'all']
-    assert by_sequence.loc[('x', 'all'), 'tp'] == 90
     assert scores.of(['00']).scans['fn'].tolist() == [1, 1]
 
 

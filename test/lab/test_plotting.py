@@ -205,6 +205,9 @@ def test_what_is_drawn_is_the_result():
     np.testing.assert_array_equal(drawn['critical points'].get_xdata(), own.r[begins])
     np.testing.assert_array_equal(drawn['candidates, inliers'].get_ydata(), own.z[own.inlier])
     np.testing.assert_array_equal(drawn['surface'].get_ydata(), own.mean)
+    relief = result.relief.at_knots(own.knots, result.grid.n_segments)[SEGMENT]
+    assert relief.any()
+    np.testing.assert_array_equal(own.mean, result.surface.mean[SEGMENT] + relief)
     # A line over the relief ends where its first and its last candidate are, nearly.
     lines = [line for line in above.lines if len(line.get_xdata()) == 16]
     assert len(lines) > 1

@@ -3,7 +3,10 @@
 import json
 import logging
 import os
+import re
 import signal
+import subprocess
+import sys
 import time
 from functools import partial
 
@@ -156,7 +159,7 @@ def _last_first(block, progress):
 
 
 def test_results_are_those_of_one_process_also_if_a_worker_dies(scheduler, tmp_path, caplog):
-    with cluster.open_runner(None, scheduler, cluster._NO_BAR) as workers:
+    with cluster.open_runner(None, scheduler, cluster.HERE.bar) as workers:
         assert workers.n_workers == 2
         found = workers.run(partial(_die_once, tmp_path / 'died'), range(40))
         assert found == [sum(range(k, k + 10)) for k in range(0, 40, 10)]
@@ -171,9 +174,15 @@ def test_results_are_those_of_one_process_also_if_a_worker_dies(scheduler, tmp_p
             workers.run(_die, [7])
 
 
+def test_a_scheduler_with_keys_answers_nobody_without(locked_scheduler, monkeypatch):
+    monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT', 0.5)
+    with pytest.raises(DataError, match='does not answer'):
+        cluster.open_runner(None, locked_scheduler[0], cluster.HERE.bar).__enter__()
+
+
 def test_workers_speak_tls_and_are_seen_on_this_machine_only():
     spawning = dask.config.set({'distributed.worker.multiprocessing-method': 'spawn'})
-    with spawning, cluster.open_runner(1, None, cluster._NO_BAR) as runner:
+    with spawning, cluster.open_runner(1, None, cluster.HERE.bar) as runner:
         assert runner.run(_last_first, range(1, 3)) == [1, 2]
         family = [psutil.Process(), *psutil.Process().children()]
         sockets = [socket for process in family for socket in process.net_connections()]
@@ -231,6 +240,24 @@ def test_processes_that_are_stopped_leave_nothing_half_done(moment, victim, tmp_
     found = label_files(out)
     assert len(found) == n_scans and len({*found.values()}) == 1
     assert len([*(out / 'sequences/00/predictions').iterdir()]) == n_scans
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_ends_meanwhile(root, tmp_path):
+    """As the machine that it runs on may."""
+    words = [sys.executable, '-m', 'distributed.cli.dask_scheduler', '--no-dashboard', '--host']
+    with subprocess.Popen(
+        [*words, 'tcp://127.0.0.1', '--port', '0'], stderr=subprocess.PIPE, text=True
+    ) as scheduler:
+        said = (re.search(r'tcp://[\d.:]+', line) for line in scheduler.stderr)
+        address = next(found[0] for found in said if found)
+        process = start('segment', root, '-o', tmp_path / 'out', '--scheduler', address)
+        next(line for line in process.stderr if 'no worker yet' in line)
+        time.sleep(1.0)
+        scheduler.kill()
+        lost = 'gp-ground-seg: error: the scheduler is lost\n'
+        assert (process.communicate(timeout=60), process.returncode) == (('', lost), 2)
+    assert not [*tmp_path.rglob('*.label')]
 
 
 def test_a_worker_of_another_version_is_refused():

@@ -140,6 +140,8 @@ def test_labels_and_heights_are_those_of_the_terrain(scene):
     height = (noisy.points[:, 2] - noisy.ground_z)[noisy.is_ground]
     assert np.abs(height).max() < 6.0 * COARSE.range_std * math.hypot(1.0, STEEPEST)
     assert np.median(np.abs(height)) < COARSE.range_std
+    of_kinds = semantic_kitti_labels(np.arange(len(Kind), dtype=np.uint8))
+    assert of_kinds.tolist() == [40, 10, 50, 80, 52, 1, 70, 30, 31]
     height, kind = exact.points[:, 2] - exact.ground_z, exact.kind
     # float32 keeps 7 digits of 120 m, and a kerb's face triples what is lost across it.
     assert np.abs(height[exact.is_ground]).max() < 3e-5

@@ -91,15 +91,17 @@ def find_dead_constants(trees):
                 yield f'{path}: {name} is read nowhere'
 
 
-CHECKS = (
-    find_dead_constants,
-    find_formulas_that_stand_twice,
-    find_returned_arrays,
-    find_reordered_sums,
-)
+VIOLATIONS = {
+    find_dead_constants: 'ONE = 1',
+    find_formulas_that_stand_twice: '@shared\ndef formula(x): ...',
+    find_returned_arrays: '@jit(entry=True)\ndef f() -> tuple[int, Lines]: ...',
+    find_reordered_sums: '@jit(fastmath=True)\ndef f(x, y): x[0] += y[0]',
+}
 
 
-@pytest.mark.parametrize('find', CHECKS)
+@pytest.mark.parametrize('find', VIOLATIONS)
 def test_the_code_keeps_the_rules(find):
     found = list(find(parse(REPOSITORY / PACKAGE)))
     assert not found, '\n'.join(found)
+    (violation,) = find({'core/gp/f.py': ast.parse(VIOLATIONS[find])})
+    assert violation.startswith('core/gp/f.py: ')

@@ -85,6 +85,9 @@ def faults(page, text):
     for figure in figures.find_figures(page, text):
         if figure.digest != figures.digest(figure.body) or 'commit ' not in figure.body:
             yield f'{figure.command}: not made yet, or changed by hand: {ANEW}'
+        shown = re.match('`(.*)` \\(commit ', figure.body)
+        if shown and is_refused(shown[1]):
+            yield f'{shown[1]}: is refused'
     rest = GENERATED.sub('', text)
     yield from ['a table of numbers without its command'] * ('--: |' in rest)
     images = set(re.findall(r'^!\[.*\]\((.*)\)$', rest, re.MULTILINE)) - NOT_MADE_HERE

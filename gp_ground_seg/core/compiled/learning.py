@@ -17,16 +17,7 @@ from gp_ground_seg.core.gp.learning import (
 from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, LearningConfig, ObservationConfig
 
-
-@compiled_form(set_likelihood)
-def _set_likelihood(
-    theta: FloatArray,
-    inliers: Inliers,
-    observation: ObservationConfig,
-    latent_terms: bool,
-    gradient: FloatArray,
-) -> float:
-    return log_likelihood(theta, inliers, observation, latent_terms, gradient)
+compiled_form(set_likelihood)(log_likelihood)
 
 
 @jit(entry=True)

@@ -33,7 +33,6 @@ class _Latent(NamedTuple):
     beta: FloatArray  # (p,)
 
 
-@jit(part=True)
 def log_likelihood(
     theta: FloatArray,
     inliers: Inliers,
@@ -41,7 +40,7 @@ def log_likelihood(
     latent_terms: bool,
     gradient: FloatArray,
 ) -> float:
-    """Return what the twin returns, and set `gradient` (T,)."""
+    """Return what the twin returns, and set `gradient` (T,): `set_likelihood` in compiled code."""
     value, own = 0.0, np.empty(len(theta))
     for i in range(len(theta)):
         gradient[i] = 0.0

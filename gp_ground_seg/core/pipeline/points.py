@@ -187,11 +187,9 @@ def single_precision(xyz: PointArray) -> PointArray:
     if xyz.dtype == np.float32:
         return xyz
     largest = np.finfo(np.float32).max
-    with np.errstate(over='ignore', invalid='ignore'):
-        single = xyz.astype(np.float32)
-        too_large = np.isinf(single) & np.isfinite(xyz)
-        single[too_large] = np.copysign(largest, xyz[too_large])
-    return single
+    with np.errstate(invalid='ignore'):
+        nearest = np.where(np.isinf(xyz), xyz, np.clip(xyz, -largest, largest))
+        return nearest.astype(np.float32)
 
 
 def finite_points(xyz: PointArray) -> BoolArray:

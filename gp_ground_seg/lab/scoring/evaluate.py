@@ -22,7 +22,7 @@ from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.semantic_kitti import Frame
+from gp_ground_seg.data.semantic_kitti import VEGETATION, Frame
 from gp_ground_seg.lab.cluster import HERE, Progress, Runner
 from gp_ground_seg.lab.scoring import metrics, objects
 from gp_ground_seg.lab.scoring.metrics import COUNTS, Labels
@@ -72,10 +72,11 @@ class Method(Protocol):
     """Something that labels scans, one sequence after the other."""
 
     name: str
-    depends_on_past: bool  # whether the labels of a scan depend on the scans before it
+    depends_on_past: bool = False  # whether the labels of a scan depend on the scans before it
 
     def reset(self, scan: KnownScan) -> None:
-        """Forget what was learned from earlier scans; `scan` is the next."""
+        """Forget what was learned from earlier scans, if anything is; `scan` is the next."""
+        return
 
     def run(self, points: Points) -> None:
         """Segment a scan of (N, 4) x, y, z, intensity: the part that is timed."""
@@ -84,10 +85,8 @@ class Method(Protocol):
         """Return the result of the last scan."""
 
 
-class OurMethod:
+class OurMethod(Method):
     """`GroundSegmenter` as a method; `last` is its last result."""
-
-    depends_on_past = False
 
     def __init__(self, config: Config, name: str = OURS, backend: Backend | None = None) -> None:
         self.name, self._segmenter = name, GroundSegmenter(config, backend=backend)
@@ -95,9 +94,6 @@ class OurMethod:
     def __reduce__(self) -> tuple[Any, ...]:
         """Send the configuration to a worker."""
         return type(self), (self._segmenter.config, self.name)
-
-    def reset(self, scan: KnownScan) -> None:
-        """Do nothing: each scan is segmented by itself."""
 
     def run(self, points: Points) -> None:
         """Segment a scan."""
@@ -146,7 +142,8 @@ def labelled_scan(
     truth = metrics.true_labels(semantic)
     is_ground = truth == Label.GROUND
     found = objects.labelled_objects(points, entries, is_ground)
-    low = objects.cut_objects(points, found.can_be_cut, is_ground, cut) if cut else None
+    can_be_cut = (found.class_of >= 0) & (semantic != VEGETATION)
+    low = objects.cut_objects(points, can_be_cut, is_ground, cut) if cut else None
     return KnownScan(sequence, index, points, truth, semantic, z, is_ground, found, cut=low)
 
 
@@ -293,10 +290,9 @@ class Scores(NamedTuple):
         """Whether the scans are labelled."""
         return 'tp' in self.scans
 
-    def of(self, sequences: Iterable[str]) -> Scores:
+    def of(self, sequences: Sequence[str]) -> Scores:
         """Return the part of some sequences."""
-        names = [*sequences]
-        return Scores(*(frame[frame['sequence'].isin(names)] for frame in self))
+        return Scores(*(frame[frame['sequence'].isin(sequences)] for frame in self))
 
 
 def make_scores(parts: Iterable[Rows]) -> Scores:
@@ -307,14 +303,6 @@ def make_scores(parts: Iterable[Rows]) -> Scores:
     for own in rows.values():
         own.sort(key=lambda row: methods.index(row['method']))
     return Scores(*(frame_of(own, COLUMNS[name]) for name, own in rows.items()))
-
-
-def with_all(frame: DataFrame, column: str = 'sequence') -> DataFrame:
-    """Return the rows, and below them each once more in the group `ALL` of a column."""
-    found: DataFrame = require_pandas().concat(
-        [frame, frame.assign(**{column: ALL})], ignore_index=True
-    )
-    return found
 
 
 def sums(frame: DataFrame, *by: str) -> DataFrame:

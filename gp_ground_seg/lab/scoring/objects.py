@@ -70,13 +70,6 @@ class Objects(NamedTuple):
     object_id: npt.NDArray[np.integer]  # (N,) number of it within its class; 0 = not known
     ground_z: npt.NDArray[np.floating]  # (N,) local ground [m]; NaN = not known: does not count
 
-    @property
-    def can_be_cut(self) -> BoolArray:
-        """Which returns lie on objects that are no plants, (N,)."""
-        is_plant = self.class_of == list(CLASSES).index(PLANTS)
-        result: BoolArray = (self.class_of >= 0) & ~is_plant
-        return result
-
 
 OBJECT_COUNTS = ('n_returns', 'n_ground', 'n_objects', 'n_lost')
 """Returns from `MIN_HEIGHT` above the ground, and those called ground; objects with at least

@@ -15,7 +15,7 @@ import numpy as np
 
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.lab.scoring import metrics, objects
-from gp_ground_seg.lab.scoring.evaluate import KEYS, STAGE, Scores, sums, with_all
+from gp_ground_seg.lab.scoring.evaluate import ALL, KEYS, STAGE, Scores, sums
 from gp_ground_seg.lab.scoring.metrics import Measure, ratio, share
 from gp_ground_seg.lab.scoring.report import (
     PEER,
@@ -24,6 +24,7 @@ from gp_ground_seg.lab.scoring.report import (
     Report,
     Table,
     records,
+    require_pandas,
 )
 
 if TYPE_CHECKING:
@@ -222,7 +223,9 @@ def _grouped(
 
     The measure `interval` has one of the difference to the peer.
     """
-    rows = frame if by == 'class' else with_all(frame, by)
+    # The rows of all are each once more.
+    parts = [frame] if by == 'class' else [frame, frame.assign(**{by: ALL})]
+    rows = require_pandas().concat(parts, ignore_index=True)
     found = measured(rows, by)
     if 'n_lost' in found:
         found['n_lost'] = found['n_lost'].where(found['n_objects'] > 0)

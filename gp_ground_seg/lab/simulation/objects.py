@@ -214,6 +214,14 @@ def floating_box(
     return replace(box, bottom=bottom, top=bottom + size[2])
 
 
+def upright(
+    terrain: Terrain, kind: Kind, at: tuple[float, float], low: float, high: float, radius: float
+) -> Cylinder:
+    """Cylinder between two heights over the terrain [m]."""
+    ground = float(terrain.height(*at))
+    return Cylinder(kind, *at, ground + low, ground + high, radius)
+
+
 def crate(
     terrain: Terrain, x: float, y: float, height: float, yaw: float = 0.0
 ) -> tuple[Solid, ...]:
@@ -225,8 +233,7 @@ def pole(
     terrain: Terrain, x: float, y: float, height: float = 6.0, radius: float = 0.1
 ) -> Cylinder:
     """Pole that stands on the terrain."""
-    ground = float(terrain.height(x, y))
-    return Cylinder(Kind.POLE, x, y, ground - BURIED_DEPTH, ground + height, radius)
+    return upright(terrain, Kind.POLE, (x, y), -BURIED_DEPTH, height, radius)
 
 
 def car(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Solid, ...]:

@@ -13,12 +13,12 @@ import numpy as np
 from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.lab.simulation.objects import (
     SMALLEST_RATE,
-    Cylinder,
     Interval,
     Kind,
     Solid,
     floating_box,
     parts_of,
+    upright,
 )
 from gp_ground_seg.lab.simulation.terrain import Terrain
 
@@ -144,11 +144,8 @@ def _extruded(
 
 def person(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
     """Person 1.7 m tall: legs, trunk and head."""
-    return parts_of(
-        x, y,
-        (_upright(terrain, Kind.PERSON, (x, y), *part)
-         for part in ((0.0, 0.85, 0.13), (0.8, 1.45, 0.22), (1.4, 1.7, 0.1))),
-    )  # fmt: skip
+    parts = (0.0, 0.85, 0.13), (0.8, 1.45, 0.22), (1.4, 1.7, 0.1)
+    return parts_of(x, y, (upright(terrain, Kind.PERSON, (x, y), *part) for part in parts))
 
 
 def cyclist(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
@@ -156,13 +153,5 @@ def cyclist(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
     sizes = (0.0, (1.7, 0.06, 0.68)), (0.3, (0.5, 0.32, 0.65))
     boxes = [floating_box(terrain, x, y, size, low, Kind.CYCLIST) for low, size in sizes]
     parts = ((0.9, 1.5, 0.2), (1.45, 1.75, 0.11))
-    rider = [_upright(terrain, Kind.CYCLIST, (x, y), *part) for part in parts]
+    rider = [upright(terrain, Kind.CYCLIST, (x, y), *part) for part in parts]
     return parts_of(x, y, (*boxes, *rider))
-
-
-def _upright(
-    terrain: Terrain, kind: Kind, at: tuple[float, float], low: float, high: float, radius: float
-) -> Cylinder:
-    """Cylinder between two heights over the terrain [m]."""
-    ground = float(terrain.height(*at))
-    return Cylinder(kind, *at, ground + low, ground + high, radius)
