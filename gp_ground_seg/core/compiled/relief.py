@@ -259,7 +259,7 @@ def reachable(
     for aside in range(1, N_ASIDE + 1):
         _step_aside(candidates, allowed, aside, walk)
     _step_in_front(candidates, steep, walk)
-    is_land = allowed.copy()
+    is_land: BoolArray = allowed.copy()
     _leave_out_not_entered(candidates, walk, is_land)
     parent, n_seeds = walk.parent, np.zeros(n, np.int64)
     for c in range(n):
