@@ -36,7 +36,13 @@ from gp_ground_seg.core.gp.learning import Learned, theta_space
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import numbers_of
-from gp_ground_seg.core.pipeline.labels import depth_of_ground, lowest_of, number_shift, sum_units
+from gp_ground_seg.core.pipeline.labels import (
+    depth_of_ground,
+    highest_ground,
+    lowest_of,
+    number_shift,
+    sum_units,
+)
 from gp_ground_seg.core.pipeline.lines import find_lines, trace
 from gp_ground_seg.core.pipeline.points import in_columns
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
@@ -166,6 +172,7 @@ class NumbaBackend:
             surface.knots[0],
             numbers_of(config.label),
             depth_of_ground(height, config.label),
+            highest_ground(height),
             sum_units(n_points),
             number_shift(n_points),
             lowest_of(surface),

@@ -57,6 +57,7 @@ def label_points(
     nearest: float,
     config: LabelConfig,
     depth: float,
+    highest: float,
     units: float,
     shift: int,
     lowest: float,
@@ -66,18 +67,18 @@ def label_points(
     """Height, label and margin of each point, into `result`.
 
     Here `Scan.xyz` is (3, N). `pieces` are those of `linear_pieces`, from the range `nearest` on,
-    `land` those of the relief, and `is_level` says whether it is level; `depth`, `units`, `shift`
-    and `lowest` are those of `depth_of_ground`, `sum_units`, `number_shift` and `lowest_of`;
-    `by_roughness` is the rule of the parameters.
+    `land` those of the relief, and `is_level` says whether it is level; `depth`, `highest`,
+    `units`, `shift` and `lowest` are those of `depth_of_ground`, `highest_ground`, `sum_units`,
+    `number_shift` and `lowest_of`; `by_roughness` is the rule of the parameters.
     """
     n_tiles, number = len(scan.tiles.place), result.height.dtype.type
     tables, roughness = (pieces, land, is_level, number(nearest)), np.zeros(n_tiles + 1)
-    near_tile, sums = _survey(scan, *tables, units, shift, result.height)
+    near_tile, sums = _survey(scan, *tables, highest, units, shift, result.height)
     if by_roughness:
         set_roughness(scan.tiles, sums, faces.is_face, units, shift, roughness)
     bands, tops = np.empty((2, n_tiles + 1), result.height.dtype)
     for t in range(n_tiles + 1):
-        bands[t], tops[t] = ground_band(roughness[t], config), math.inf
+        bands[t], tops[t] = ground_band(roughness[t], highest, config), math.inf
         if faces.is_face[t]:
             low, is_occluded = np.float64(scan.tiles.extremes[t, 0]), faces.has_occluded_base[t]
             tops[t] = top_of_face(roughness[t], low, is_occluded, config)
@@ -93,6 +94,7 @@ def _survey(
     land: PointArray,
     is_level: bool,
     nearest: float,
+    highest: float,
     units: float,
     shift: int,
     height: PointArray,
@@ -113,7 +115,7 @@ def _survey(
         r, cell = scan.grid.r[block], scan.grid.cell[block]
         _measure(z[block], r, cell, nearest, pieces, land, u, v, piece, height[block])
         tile = scan.tiles.tile[block]
-        _add_squares(height[block], tile, units, flag, near_tile[block], terms, sums)
+        _add_squares(height[block], tile, highest, units, flag, near_tile[block], terms, sums)
     return near_tile, sums
 
 
@@ -144,6 +146,7 @@ def _measure(
 def _add_squares(
     height: PointArray,
     tile: CellArray,
+    highest: float,
     units: float,
     flag: int,
     near_tile: CellArray,
@@ -154,8 +157,9 @@ def _add_squares(
     outside, quarter = np.int32(len(sums) - 1), len(height) // 4
     for i in range(len(height)):
         h = np.float64(height[i])
-        near_tile[i] = tile[i] if is_near(h) else outside
-        terms[i] = flag + np.int64(whole_units(h * h, units)) if is_near(h) else 0
+        is_low = is_near(h, highest)
+        near_tile[i] = tile[i] if is_low else outside
+        terms[i] = flag + np.int64(whole_units(h * h, units)) if is_low else 0
     # In four places in turn: points side by side share a tile, and would wait for each other.
     for k in range(quarter):
         for i in (k, k + quarter, k + 2 * quarter, k + 3 * quarter):

@@ -29,7 +29,8 @@ from gp_ground_seg.core.pipeline.roughness import ground_roughness
 
 HIGHEST_GROUND = 0.5
 """Height over the surface from which no return is ground, however rough the ground is [m]; returns
-below it tell how rough it is."""
+below it tell how rough it is. In proportion to the height of a sensor below 1 m: about a small
+robot, most of what it sees near the ground may be low furniture."""
 FINEST_UNITS = 2.0**40
 """Most of `sum_units`."""
 ROUGHNESS_IN_BAND = 2.1
@@ -68,13 +69,15 @@ def label_points(
     if not relief.is_level:
         inside = np.flatnonzero(grid.inside)
         over[inside] -= relief.at(x[inside], y[inside])
-    near, tile = np.flatnonzero(is_near(over)), as_index(tiles.tile)
+    highest = highest_ground(height)
+    near, tile = np.flatnonzero(is_near(over, highest)), as_index(tiles.tile)
     roughness = np.zeros(len(faces.is_face))
     if by_roughness:
         units = sum_units(len(over))
         sums = near_sums(over[near], tile[near], faces.is_face, units)
         roughness = ground_roughness(tiles, sums, units)
-    band, top = ground_band(roughness, label).astype(dtype), np.full(len(roughness), np.inf, dtype)
+    band = ground_band(roughness, highest, label).astype(dtype)
+    top = np.full(len(roughness), np.inf, dtype)
     at, occluded = np.flatnonzero(faces.is_face), faces.has_occluded_base[faces.is_face]
     top[at] = top_of_face(roughness[at], tiles.lowest_z[at].astype(np.float64), occluded, label)
     depth = depth_of_ground(height, label)
@@ -98,20 +101,25 @@ def depth_of_ground(height: float, label: LabelConfig) -> float:
     return by_roughness if label.rule == 'roughness' else label.ground_tolerance
 
 
+def highest_ground(height: float) -> float:
+    """Largest height of rough ground over the surface for a sensor at a `height` [m]."""
+    return min(height, 1.0) * HIGHEST_GROUND
+
+
 @shared
-def is_near(height: Values) -> Values:
+def is_near(height: Values, highest: float) -> Values:
     """Whether a return so high over the surface [m] tells its roughness."""
-    return (height < HIGHEST_GROUND) & (height >= -HIGHEST_GROUND)
+    return (height < highest) & (height >= -highest)
 
 
 @shared
-def ground_band(roughness: Values, label: LabelConfig) -> Values:
+def ground_band(roughness: Values, highest: float, label: LabelConfig) -> Values:
     """Largest height of ground over the surface, where the ground is so rough [m].
 
     See `gp_ground_seg.core.pipeline.roughness.ground_roughness`: an object on the ground does
     not widen the band, since it fills few of the tiles about it.
     """
-    likely = np.minimum(ROUGHNESS_IN_BAND * roughness, HIGHEST_GROUND)
+    likely = np.minimum(ROUGHNESS_IN_BAND * roughness, highest)
     return np.maximum(likely, label.ground_tolerance)
 
 
