@@ -38,6 +38,10 @@ FILES = {
     HEAD
     + '    input: {crop_box: []}\n': 'd.yaml: input.crop_box = []: ROS does not read an empty',
     HEAD + '    grid: {n_bins: 1_80}\n': "d.yaml: grid.n_bins = '1_80': must be an integer",
+    HEAD + '    sensor.height: !!float "1.0"\n': "d.yaml: sensor.height = '1.0': must be auto",
+    HEAD + '    surface.look_aside: 1\n': 'd.yaml: surface.look_aside = 1: must be true or false',
+    '/1a:\n  ros__parameters: {}\n': 'node name must not start with a number',
+    'a b:\n  ros__parameters: {}\n': 'node name must not contain characters other than alphanum',
     'a/:\n  ros__parameters: {sensor.height: 1.0}\n': 'node name must not be empty',
     'label: {ground_tolerance: 0.1}\n': 'd.yaml: no ros__parameters, which the node needs',
     '/**:\n  a:\n    grid: {n_bins: 50}\n': 'd.yaml: no ros__parameters',
@@ -58,6 +62,9 @@ WORDS = {
         for rule in (
             'points:=/1;2',
             '__node:=1st',
+            '__node:=',
+            '__node:=a/b',
+            'points:=~front',
             '__ns:=front',
             '__ns:=/1a',
             'points:=lidar/',
@@ -74,7 +81,12 @@ WORDS = {
     f'-p {QOS}.reliability:=maybe': 'policy `reliability`: `maybe`',
     f'-p {QOS}.depth:=-3': 'depth = -3: must be an integer in [1, 10000]',
     '-p input.crop_box:=[1.0,0.0,0.0,1.0,0.0,1.0]': 'must be none or six numbers in [-100',
-    '-p input.crop_box:=[]': 'an empty list: ROS does not read an empty list; write none',
+    '-p input.crop_box:=[]': 'error: input.crop_box = []: ROS does not read an empty list; write',
+    '-p x:=[]': 'error: x = []: ROS does not read an empty list; write none',
+    '-p sensor.height:=': "'-p sensor.height:='.*: must be NAME:=VALUE",
+    '-p sensor.height:=1,5': "error: sensor.height = '1,5': must be auto or a number in",
+    '-p label.rule:=rough': "error: label.rule = 'rough': must be one of roughness, tolerance",
+    '-p use_sim_time:=1': 'must be true or false',
     **{
         f'ROS_DOMAIN_ID={value}': f'= {value}: must be an integer in [0, 232]'
         for value in ('999', 'a', '-1')
