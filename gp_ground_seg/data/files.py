@@ -43,6 +43,8 @@ def read_bytes(path: str | Path, most: int, expected: str = '') -> bytes:
     if max(size, len(data)) > most:
         expected = expected or f'accepted are at most {most}'
         raise DataError(f'{path}: {max(size, len(data))} bytes, {expected}')
+    if data.startswith(b'version https://git-lfs'):
+        raise DataError(f'{path}: stands for the file in Git LFS: `git lfs pull` fetches it')
     return data
 
 
