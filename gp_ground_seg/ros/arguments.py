@@ -121,14 +121,12 @@ def objections_of_ros(path: str | Path) -> list[str]:
     """Return why ROS's own parser refuses a parameter file; nothing where ROS is not installed."""
     check_middleware()
     try:
-        from rclpy.utilities import remove_ros_args
+        with contextlib.suppress(ImportError), start_errors():
+            from rclpy.utilities import remove_ros_args
 
-        with start_errors():
             remove_ros_args(['', '--ros-args', '--params-file', str(path)])
     except ConfigError as error:
         return [str(error).rpartition('Error: ')[2]]
-    except ImportError:
-        pass
     return []
 
 

@@ -165,9 +165,8 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         if config != self._config:
             self.apply_config(config)
             before, self._config = self._config, config
-            for name, value in config.flat().items():
-                if value != before[name]:
-                    self.get_logger().info(f'{name}: {before[name]} -> {value}')
+            for spec, old, new in before.differences(config):
+                self.get_logger().info(f'{spec.name}: {old} -> {new}')
 
 
 def _typed(parameter: Parameter) -> Parameter:

@@ -80,17 +80,14 @@ def take_points(points: npt.ArrayLike, origin: Direction | None = None) -> Point
 def hint_of_table(array: npt.NDArray[Any]) -> str:
     """Return how an array becomes a table of points: a structured or flat one, or an image."""
     shape = array.shape
-    if array.dtype.names:
-        how = "numpy.stack([points[name] for name in 'xyz'], axis=1)"
-    elif len(shape) == 1 and array.size:
-        how = '.reshape(-1, COLUMNS)'
-    elif len(shape) > 2 and 3 <= shape[-1] <= _MOST_ROWS:
-        how = f'.reshape(-1, {shape[-1]})'
-    elif len(shape) > 2 and 3 <= shape[0] <= _MOST_ROWS:
-        how = f'.reshape({shape[0]}, -1).T'
-    else:
-        return ''
-    return f'; it is a table after {how}'
+    first, last = (shape[0], shape[-1]) if len(shape) > 2 else (0, 0)
+    hints = {
+        "numpy.stack([points[name] for name in 'xyz'], axis=1)": bool(array.dtype.names),
+        '.reshape(-1, COLUMNS)': len(shape) == 1,
+        f'.reshape(-1, {last})': 3 <= last <= _MOST_ROWS,
+        f'.reshape({first}, -1).T': 3 <= first <= _MOST_ROWS,
+    }
+    return next((f'; it is a table after {how}' for how, helps in hints.items() if helps), '')
 
 
 def leave_out_empty_rays(xyz: PointArray, origin: Direction, written: np.dtype[Any]) -> None:
