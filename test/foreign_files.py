@@ -80,6 +80,26 @@ CASES |= {
     ),
     'more_rows.npz': (npz(a=npy(-XYZ[:3]), b=npy(XYZ), calib=npy(np.eye(9))), 'x y z'),
     'colours.npz': (npz(colours=npy(XYZ)), r'must be x, y, z, or one \(N, 3\)'),
+    'structured.npy': (npy(np.rec.fromarrays(XYZ.T, names='X,Y,Z')), 'X Y Z'),
+    'fields.npz': (
+        npz(
+            X=npy(XYZ[:, 0]),
+            Y=npy(XYZ[:, 1]),
+            Z=npy(XYZ[:, 2]),
+            points=npy(RING),
+            pose=npy(np.eye(3)),
+        ),
+        'X Y Z points',
+    ),
+    **{
+        f'{name}.npz': (
+            npz(
+                **{name: npy(np.hstack([XYZ, XYZ])), 'ring': npy(RING), 'pose': npy(np.eye(3)[0])}
+            ),
+            'x y z intensity column_5 column_6 ring',
+        )
+        for name in ('points', 'xyzi', 'arr_0')
+    },
     'image_of_ranges.npy': (npy(np.ones((40, 90))), 'a point is a row: save its .T'),
     'text.npy': (text_of(XYZ), r"no file of numpy; it begins with b'0.0 1.0 2.0"),
     'pickle.npz': (b'\x80\x04K\x01.', r"no file of numpy; it begins with b'\\x80"),
@@ -91,10 +111,6 @@ CASES |= {
     ),
     'mesh.npz': (npz(vertices=npy(XYZ), faces=npy(np.zeros((9, 3), int))), 'x y z'),
     'boxes.npz': (npz(boxes=npy(np.zeros((9, 7))), lidar=npy(XYZ)), 'x y z'),
-    'capital_columns.npz': (
-        npz(**{k: npy(v) for k, v in zip('XYZ', XYZ.T, strict=True)}),
-        'X Y Z',
-    ),
     'columns_of_2d.npz': (npz(x=npy(XYZ[:, :1]), y=npy(RING), z=npy(RING)), r"x \('<f4', \(1,"),
     'words.npy': (npy(XYZ.astype(str)), 'no field x of one number per point; fields: x <U'),
     'halves.npy': (npy(XYZ.astype('f2')), 'x y z'),

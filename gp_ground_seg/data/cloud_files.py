@@ -88,9 +88,10 @@ def _table_of(arrays: Columns) -> str:
     }
     most = [name for name, n_rows in tables.items() if n_rows == max(tables.values())]
     if len(most) != 1:
-        raise PointCloudError(
-            f'arrays {_shapes(arrays)}: must be x, y, z, or one (N, 3) or wider; call it {TABLE}'
-        )
+        found = ', '.join(f'{name} {values.shape}' for name, values in arrays.items()) or 'none'
+        found = textwrap.shorten(found, 200, placeholder=' ...')
+        wanted = f'x, y, z, or one (N, 3) or wider; call it {TABLE}'
+        raise PointCloudError(f'arrays {found}: must be {wanted}')
     return most[0]
 
 
@@ -105,12 +106,6 @@ def _points_of(table: npt.NDArray[Any]) -> Fields:
         problem = 'is transposed, or an image of ranges; a point is a row: save its .T'
         raise PointCloudError(f'array of shape {table.shape}: {problem}')
     return name_columns(table)
-
-
-def _shapes(arrays: Columns) -> str:
-    """Name and shape of each array, cut where they are many."""
-    found = ', '.join(f'{name} {values.shape}' for name, values in arrays.items()) or 'none'
-    return textwrap.shorten(found, 200, placeholder=' ...')
 
 
 def _encode_npy(cloud: Cloud) -> bytes:

@@ -51,7 +51,11 @@ FILES = {
     '/**:\n\tros__parameters:\n': 'd.yaml: not valid YAML',
     '\xff\xfe\0\x80': 'd.yaml: not a text file',
 }  # fmt: skip
-NO_RULES = ['points:=/1;2', '__node:=1st', '__node:=', '__node:=a/b', '__ns:=front', '__ns:=/1a', 'points:=lidar/', 'points:=~front', 'points:=/1lidar', 'points:=/a//b', 'points:=/front-left', 'points=/a']
+NO_RULES = (
+    'points:=/1;2', '__node:=1st', '__node:=', '__node:=a/b', '__ns:=front', '__ns:=/1a',
+    'points:=lidar/', 'points:=~front', 'points:=/1lidar', 'points:=/a//b', 'points:=/front-left',
+    'points=/a',
+)  # fmt: skip
 WORDS = {
     '--params-file nowhere.yaml': 'error: nowhere.yaml: No such file',
     '--params-file .': 'error: .: Is a directory',
