@@ -57,10 +57,11 @@ def npz(**members):
     file = io.BytesIO()
     with zipfile.ZipFile(file, 'w', zipfile.ZIP_DEFLATED) as archive:
         for name, data in members.items():
-            archive.writestr(f'{name}.npy', data)
+            archive.writestr(f'{name}.npy', data if isinstance(data, bytes) else npy(data))
     return file.getvalue()
 
 
+WIDE_TABLE = 'x y z intensity column_5 column_6 ring'
 NESTED = npy(np.zeros(4, [('p', [('x', 'f4'), ('y', 'f4')])]))
 CASES |= {
     'objects.npy': (npy(np.array([{}, 1]), allow_pickle=True), 'Object arrays cannot be'),
@@ -70,54 +71,35 @@ CASES |= {
     'nested.npy': (NESTED, 'no field x of one number per point; fields: p'),
     'flat.npy': (npy(np.arange(9.0)), r'array of shape \(9,\): must be \(N, 3\)'),
     'shape.npz': (npz(a=npy_header((10**9, 3)) + bytes(10**6)), r'cannot be read as \.npz \('),
-    'names.npz': (
-        npz(a=npy(XYZ), b=npy(XYZ)),
-        r'arrays a \(4, 3\), b \(4, 3\):.*; call it points',
-    ),
+    'names.npz': (npz(a=XYZ, b=XYZ), r'arrays a \(4, 3\), b \(4, 3\):.*; call it points'),
     'open3d.npz': (
-        npz(colors=npy(-XYZ), normals=npy(-XYZ), pose=npy(np.eye(4)[:3]), positions=npy(XYZ)),
-        'x y z colors normals',
+        npz(colors=-XYZ, normals=-XYZ, pose=np.eye(4)[:3], positions=XYZ), 'x y z colors normals'
     ),
-    'more_rows.npz': (npz(a=npy(-XYZ[:3]), b=npy(XYZ), calib=npy(np.eye(9))), 'x y z'),
-    'colours.npz': (npz(colours=npy(XYZ)), r'must be x, y, z, or one \(N, 3\)'),
+    'more_rows.npz': (npz(a=-XYZ[:3], b=XYZ, calib=np.eye(9)), 'x y z'),
+    'colours.npz': (npz(colours=XYZ), r'must be x, y, z, or one \(N, 3\)'),
     'structured.npy': (npy(np.rec.fromarrays(XYZ.T, names='X,Y,Z')), 'X Y Z'),
     'fields.npz': (
-        npz(
-            X=npy(XYZ[:, 0]),
-            Y=npy(XYZ[:, 1]),
-            Z=npy(XYZ[:, 2]),
-            points=npy(RING),
-            pose=npy(np.eye(3)),
-        ),
-        'X Y Z points',
+        npz(points=RING, pose=np.eye(3), **dict(zip('XYZ', XYZ.T, strict=True))), 'points X Y Z'
     ),
     **{
-        f'{name}.npz': (
-            npz(
-                **{name: npy(np.hstack([XYZ, XYZ])), 'ring': npy(RING), 'pose': npy(np.eye(3)[0])}
-            ),
-            'x y z intensity column_5 column_6 ring',
-        )
-        for name in ('points', 'xyzi', 'arr_0')
+        f'{k}.npz': (npz(pose=np.eye(3)[0], ring=RING, **{k: np.hstack([XYZ, XYZ])}), WIDE_TABLE)
+        for k in ('points', 'xyzi', 'arr_0')
     },
     'image_of_ranges.npy': (npy(np.ones((40, 90))), 'a point is a row: save its .T'),
     'text.npy': (text_of(XYZ), r"no file of numpy; it begins with b'0.0 1.0 2.0"),
     'pickle.npz': (b'\x80\x04K\x01.', r"no file of numpy; it begins with b'\\x80"),
     'read_from_a_bin.npy': (npy(XYZ.ravel()), r'a table after \.reshape\(-1, COLUMNS\)'),
     'rows_of_images.npy': (npy(XYZ.reshape(1, 4, 3)), r'a table after \.reshape\(-1, 3\)'),
-    'channels_first.npz': (
-        npz(a=npy(np.zeros((3, 9, 90)))),
-        r'a table after \.reshape\(3, -1\)\.T',
-    ),
-    'mesh.npz': (npz(vertices=npy(XYZ), faces=npy(np.zeros((9, 3), int))), 'x y z'),
-    'boxes.npz': (npz(boxes=npy(np.zeros((9, 7))), lidar=npy(XYZ)), 'x y z'),
-    'columns_of_2d.npz': (npz(x=npy(XYZ[:, :1]), y=npy(RING), z=npy(RING)), r"x \('<f4', \(1,"),
+    'channels_first.npz': (npz(a=np.zeros((3, 9, 90))), r'a table after \.reshape\(3, -1\)\.T'),
+    'mesh.npz': (npz(vertices=XYZ, faces=np.zeros((9, 3), int)), 'x y z'),
+    'boxes.npz': (npz(boxes=np.zeros((9, 7)), lidar=XYZ), 'x y z'),
+    'columns_of_2d.npz': (npz(x=XYZ[:, :1], y=RING, z=RING), r"x \('<f4', \(1,"),
     'words.npy': (npy(XYZ.astype(str)), 'no field x of one number per point; fields: x <U'),
     'halves.npy': (npy(XYZ.astype('f2')), 'x y z'),
     'turned_bytes.npy': (npy(np.asfortranarray(XYZ.astype('>f8'))), 'x y z'),
     'image.npy': (npy(XYZ.reshape(2, 2, 3)), r'a table after \.reshape\(-1, 3\)'),
-    'image.npz': (npz(a=npy(np.zeros((8, 9, 4)))), r'a table after \.reshape\(-1, 4\)'),
-}
+    'image.npz': (npz(a=np.zeros((8, 9, 4))), r'a table after \.reshape\(-1, 4\)'),
+}  # fmt: skip
 
 
 # PCD.
@@ -432,4 +414,4 @@ CASES |= {
     'a_list': (folder(lambda text: '- 1'), REINDEX),
     'no_yaml': (folder(lambda text: 'a: ['), REINDEX),
     'missing_file': (replaced('- missing', '- no'), REINDEX),
-}
+}  # fmt: skip
