@@ -66,10 +66,8 @@ def naming(place: str | Path, what: str = '') -> Iterator[None]:
         yield
     except PointCloudError as error:
         raise DataError(f'{place}: {error}') from error
-    except GroundSegError:
-        raise
     except Exception as error:  # Of many types: struct.error, zlib.error, sqlite3, lz4, ...
-        if not what:
+        if not what or isinstance(error, GroundSegError):
             raise
         said = f'{type(error).__name__}: {in_one_line(error)}'
         raise DataError(f'{place}: {what} ({said})') from error

@@ -160,6 +160,6 @@ def unused_files(words: Sequence[str], node_name: str) -> list[str]:
 
 def _is_of_node(key: str, node_name: str) -> bool:
     """Whether rclpy gives the parameters of `key` to a node: ``*`` is any word, ``**`` several."""
-    rooted = key if key.startswith('/') else f'/{key}'
+    rooted = f'/{key.removeprefix("/")}'
     # rcl has accepted the key: apart from * it has letters, digits, _ and / only.
     return re.fullmatch(rooted.replace('/*', r'(/\w+)'), node_name) is not None

@@ -366,11 +366,10 @@ class _Loader(yaml.SafeLoader):
         return float.fromhex(node.value) if is_hex else super().construct_yaml_float(node)
 
 
-_SWITCHES = 'y', 'yes', 'true', 'on', 'n', 'no', 'false', 'off'
 _HEX = r'0[xX]([0-9a-fA-F]+\.?[0-9a-fA-F]*|\.[0-9a-fA-F]+)([pP][-+]?[0-9]+)?'
 _WORDS = {
     'null': '',
-    'bool': '|'.join(f'{word}|{word.capitalize()}|{word.upper()}' for word in _SWITCHES),
+    'bool': '|'.join(f'{w}|{w.capitalize()}|{w.upper()}' for w in _Loader.bool_values),
     'int': '[-+]?(0[0-7]*|[1-9][0-9]{,17}|0x[0-9a-fA-F]{1,15})',
     'float': rf'[-+]?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|{_HEX}|\.?(?i:inf|nan))',
 }
