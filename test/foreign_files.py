@@ -57,10 +57,11 @@ def npz(**members):
     file = io.BytesIO()
     with zipfile.ZipFile(file, 'w', zipfile.ZIP_DEFLATED) as archive:
         for name, data in members.items():
-            archive.writestr(f'{name}.npy', data)
+            archive.writestr(f'{name}.npy', data if isinstance(data, bytes) else npy(data))
     return file.getvalue()
 
 
+WIDE_TABLE = 'x y z intensity column_5 column_6 ring'
 NESTED = npy(np.zeros(4, [('p', [('x', 'f4'), ('y', 'f4')])]))
 CASES |= {
     'objects.npy': (npy(np.array([{}, 1]), allow_pickle=True), 'Object arrays cannot be'),
@@ -70,19 +71,35 @@ CASES |= {
     'nested.npy': (NESTED, 'no field x of one number per point; fields: p'),
     'flat.npy': (npy(np.arange(9.0)), r'array of shape \(9,\): must be \(N, 3\)'),
     'shape.npz': (npz(a=npy_header((10**9, 3)) + bytes(10**6)), r'cannot be read as \.npz \('),
-    'names.npz': (
-        npz(a=npy(XYZ), b=npy(XYZ)),
-        r'arrays a \(4, 3\), b \(4, 3\):.*; call it points',
-    ),
+    'names.npz': (npz(a=XYZ, b=XYZ), r'arrays a \(4, 3\), b \(4, 3\):.*; call it points'),
     'open3d.npz': (
-        npz(colors=npy(-XYZ), normals=npy(-XYZ), pose=npy(np.eye(4)[:3]), positions=npy(XYZ)),
-        'x y z colors normals',
+        npz(colors=-XYZ, normals=-XYZ, pose=np.eye(4)[:3], positions=XYZ), 'x y z colors normals'
     ),
-    'more_rows.npz': (npz(a=npy(-XYZ[:3]), b=npy(XYZ), calib=npy(np.eye(9))), 'x y z'),
-    'colours.npz': (npz(colours=npy(XYZ)), r'must be x, y, z, or one \(N, 3\)'),
+    'more_rows.npz': (npz(a=-XYZ[:3], b=XYZ, calib=np.eye(9)), 'x y z'),
+    'colours.npz': (npz(colours=XYZ), r'must be x, y, z, or one \(N, 3\)'),
+    'structured.npy': (npy(np.rec.fromarrays(XYZ.T, names='X,Y,Z')), 'X Y Z'),
+    'fields.npz': (
+        npz(points=RING, pose=np.eye(3), **dict(zip('XYZ', XYZ.T, strict=True))), 'points X Y Z'
+    ),
+    **{
+        f'{k}.npz': (npz(pose=np.eye(3)[0], ring=RING, **{k: np.hstack([XYZ, XYZ])}), WIDE_TABLE)
+        for k in ('points', 'xyzi', 'arr_0')
+    },
+    'image_of_ranges.npy': (npy(np.ones((40, 90))), 'a point is a row: save its .T'),
+    'text.npy': (text_of(XYZ), r"no file of numpy; it begins with b'0.0 1.0 2.0"),
+    'pickle.npz': (b'\x80\x04K\x01.', r"no file of numpy; it begins with b'\\x80"),
+    'read_from_a_bin.npy': (npy(XYZ.ravel()), r'a table after \.reshape\(-1, COLUMNS\)'),
+    'rows_of_images.npy': (npy(XYZ.reshape(1, 4, 3)), r'a table after \.reshape\(-1, 3\)'),
+    'channels_first.npz': (npz(a=np.zeros((3, 9, 90))), r'a table after \.reshape\(3, -1\)\.T'),
+    'mesh.npz': (npz(vertices=XYZ, faces=np.zeros((9, 3), int)), 'x y z'),
+    'boxes.npz': (npz(boxes=np.zeros((9, 7)), lidar=XYZ), 'x y z'),
+    'columns_of_2d.npz': (npz(x=XYZ[:, :1], y=RING, z=RING), r"x \('<f4', \(1,"),
+    'words.npy': (npy(XYZ.astype(str)), 'no field x of one number per point; fields: x <U'),
+    'halves.npy': (npy(XYZ.astype('f2')), 'x y z'),
+    'turned_bytes.npy': (npy(np.asfortranarray(XYZ.astype('>f8'))), 'x y z'),
     'image.npy': (npy(XYZ.reshape(2, 2, 3)), r'a table after \.reshape\(-1, 3\)'),
-    'image.npz': (npz(a=npy(np.zeros((8, 9, 4)))), r'a table after \.reshape\(-1, 4\)'),
-}
+    'image.npz': (npz(a=np.zeros((8, 9, 4))), r'a table after \.reshape\(-1, 4\)'),
+}  # fmt: skip
 
 
 # PCD.
@@ -109,6 +126,11 @@ def many(n, body=RAW, data='binary', n_bytes=12):
         packed = lzf.compress(bytes(n_bytes))
         body = struct.pack('<II', len(packed), min(n * n_bytes, 2**32 - 1)) + packed
     return pcd(data=data, body=body, WIDTH=n, POINTS=n)
+
+
+def packed(**lines):
+    body = lzf.compress(XYZ.T.tobytes())
+    return pcd(data='binary_compressed', body=struct.pack('<II', len(body), 48) + body, **lines)
 
 
 def four(size='4', count='1', **lines):
@@ -143,9 +165,22 @@ CASES |= {
     'cut_text.pcd': (pcd(body=text_of(XYZ)[:-14]), 'truncated?'),
     'space_in_a_name.pcd': (pcd('x y z my ring', '4 4 4 2', 'F F F U', COUNT=None), r'a name\?'),
     'no_fields.pcd': (pcd(FIELDS=None), 'no FIELDS line'),
-    'none.pcd': (b'no header', 'no DATA line'),
+    'none.pcd': (b'no header', "no DATA line of a header in it; it begins with b'no header'"),
+    'zipped.pcd': (b'\x1f\x8b\x08', r"it begins with b'\\x1f\\x8b"),
+    'lfs.pcd': (b'version https://git-lfs.github.com/spec/v1\noid', '`git lfs pull` fetches it'),
     'commas.pcd': (pcd(body=4 * b'0,1,2\n'), 'a line of 1 words, its header says 3, separated by'),
     'no_size.pcd': (pcd(data='binary', body=RAW, WIDTH='0', HEIGHT='0'), 'x y z'),
+    'no_height.pcd': (pcd(HEIGHT='0'), 'x y z'),
+    'no_size_packed.pcd': (packed(WIDTH='0', HEIGHT='0'), 'x y z'),
+    'no_width_packed.pcd': (packed(WIDTH='0'), 'x y z'),
+    'turned.pcd': (pcd(WIDTH='1', HEIGHT='4'), 'x y z'),
+    'fraction.pcd': (pcd(WIDTH='4.0'), r'WIDTH 4\.0: must be a whole number'),
+    'cut_packed.pcd': (packed()[:-5], 'packed bytes cannot hold the 48 of its header; truncated'),
+    'no_body_packed.pcd': (pcd(data='binary_compressed', body=b'ab'), 'body of 0 bytes'),
+    'junk_packed.pcd': (
+        pcd(data='binary_compressed', body=struct.pack('<II', 40, 48) + bytes(range(40))),
+        '40 packed bytes cannot hold the 48',
+    ),
     'too_many_given.pcd': (pcd(WIDTH='0', HEIGHT='0', POINTS='5'), 'truncated?'),
     'sizes.pcd': (pcd(WIDTH='9'), '4 points, which is not width 9'),
     'many.pcd': (many(8000000), '8000000 points'),
@@ -311,6 +346,10 @@ CASES |= {
     'whole.db3': (message_of('data = 1000000000'), f"{NO_BAG}.*not 'int'"),
     'text.db3': (message_of("data = 'a'"), f"{NO_BAG}.*not 'str'"),
     'time.db3': (message_of("timestamp = 'a'"), NO_BAG),
+    'negative.db3': (message_of('timestamp = -5'), f'{NO_BAG}.*is recorded at -5 ns'),
+    'fraction.db3': (message_of('data = 3.5'), f"{NO_BAG}.*not 'float'"),
+    'no_bytes.db3': (message_of("data = x''"), '0 bytes that are no sensor_msgs/msg/PointCloud2'),
+    'zeros.db3': (message_of('data = zeroblob(99)'), '99 bytes that are no sensor_msgs'),
     'record.bag': (write_long_record, NO_BAG),
     'plain.mcap': (mcap(), THREE),
     'lz4.mcap': (mcap(compression=CompressionType.LZ4), THREE),
@@ -375,4 +414,4 @@ CASES |= {
     'a_list': (folder(lambda text: '- 1'), REINDEX),
     'no_yaml': (folder(lambda text: 'a: ['), REINDEX),
     'missing_file': (replaced('- missing', '- no'), REINDEX),
-}
+}  # fmt: skip

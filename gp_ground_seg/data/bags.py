@@ -137,6 +137,8 @@ def _open_ros(path: Path, storage: str, stack: ExitStack) -> _Contents:
     def read(topics: Collection[str]) -> _Messages:
         for c, time, raw in bag.messages([c for c in readable if c.topic in topics]):
             cdr = jazzy_types().ros1_to_cdr(raw, POINT_CLOUD2) if is_ros1 else raw
+            if time < 0:
+                raise ValueError(f'a message of {c.topic} is recorded at {time} ns')
             yield c.topic, int(time), bytes(memoryview(cdr))  # of a number, bytes are zeros
 
     return channels, read
@@ -271,17 +273,18 @@ class BagReader(AbstractContextManager['BagReader']):
 class BagWriter:
     """A new rosbag2 bag, in a ``with`` statement; written whole or not at all (`staged_file`).
 
-    `path` is a folder as ``ros2 bag record -o`` makes, stored as MCAP, or a single file, by its
+    `path` is a folder as ``ros2 bag record -o`` makes, in a `storage`, or a single file, by its
     suffix. With `force` a bag of that name is replaced. Raises DataError if the path is taken or
     cannot be written, MissingDependencyError without rosbags.
     """
 
-    def __init__(self, path: str | Path, *, force: bool = False) -> None:
+    def __init__(self, path: str | Path, *, force: bool = False, storage: str = 'mcap') -> None:
         require('rosbags.highlevel', 'rosbags')
         self.path = Path(path)
         if self.path.suffix == '.bag':
             raise DataError(f'{path}: only ROS 2 bags are written; use .mcap, .db3 or a folder')
-        if self.path.suffix == '.db3':
+        self._storage = STORAGE_OF_SUFFIX.get(self.path.suffix, storage)
+        if self._storage == 'sqlite3':
             check_sqlite_path(self.path)
         self._force = force
         self._connections: dict[str, Any] = {}
@@ -302,7 +305,7 @@ class BagWriter:
                     staged_file(self.path, force=self._force, is_kind=is_bag_folder)
                 )
             stack.enter_context(writing(self.path))
-            plugin = StoragePlugin[STORAGE_OF_SUFFIX.get(self.path.suffix, 'mcap').upper()]
+            plugin = StoragePlugin[self._storage.upper()]
             # Version 9 is what Jazzy writes.
             self._writer = stack.enter_context(Writer(folder, version=9, storage_plugin=plugin))
             self._open = stack.pop_all()

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError, PointCloudError
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.core.pipeline.points import finite_points, objection_to_ranges, reshape_hint
+from gp_ground_seg.core.pipeline.points import finite_points, hint_of_table, objection_to_ranges
 from gp_ground_seg.data.clouds import (
     Cloud,
     Columns,
@@ -54,9 +54,9 @@ _PERIOD = 840  # a multiple of all `_OTHER_COLUMNS`
 _N_PERIODS = 100  # of a larger file that are judged
 _N_CLASSES = 16  # of equally many numbers
 _MUCH_MORE, _CHANCE = 1.25, 0.05  # times as much, and by so much [nat]
-_TRANSPOSED = 20  # columns from which on a table of three or four rows is
+_TRANSPOSED = 20  # columns from which on a table of fewer rows is
 TABLE = 'points'  # array of an .npz that is a table (N, >= 3), beside fields (N, ...)
-_BESIDE = re.compile('colo|rgb|normal|label|feat|flow|pose|transform|calib', re.IGNORECASE)
+_BESIDE = re.compile('colo|rgb|normal|label|feat|flow|pose|transf|calib|face|box', re.IGNORECASE)
 
 
 def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
@@ -64,6 +64,8 @@ def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
 
     Arrays of another length than that of the points are what the file has beside them.
     """
+    if not data.startswith((b'\x93NUMPY', b'PK')):
+        raise PointCloudError(f'is no file of numpy; it begins with {data[:20]!r}')
     found = np.load(io.BytesIO(data), allow_pickle=False)
     arrays: Columns = {TABLE: found} if isinstance(found, np.ndarray) else dict(found)
     if coordinate_names(arrays)[0] not in arrays:
@@ -86,9 +88,10 @@ def _table_of(arrays: Columns) -> str:
     }
     most = [name for name, n_rows in tables.items() if n_rows == max(tables.values())]
     if len(most) != 1:
-        raise PointCloudError(
-            f'arrays {_shapes(arrays)}: must be x, y, z, or one (N, 3) or wider; call it {TABLE}'
-        )
+        found = ', '.join(f'{name} {values.shape}' for name, values in arrays.items()) or 'none'
+        found = textwrap.shorten(found, 200, placeholder=' ...')
+        wanted = f'x, y, z, or one (N, 3) or wider; call it {TABLE}'
+        raise PointCloudError(f'arrays {found}: must be {wanted}')
     return most[0]
 
 
@@ -97,17 +100,12 @@ def _points_of(table: npt.NDArray[Any]) -> Fields:
     if table.dtype.names:
         return table.ravel()
     if table.ndim != 2 or table.shape[1] < 3:
-        hint = reshape_hint(table.shape)
+        hint = hint_of_table(table)
         raise PointCloudError(f'array of shape {table.shape}: must be (N, 3) or wider{hint}')
-    if table.shape[0] in (3, 4) and table.shape[1] >= _TRANSPOSED:
-        raise PointCloudError(f'array of shape {table.shape}: is transposed; save its .T')
+    if 0 < table.shape[0] < table.shape[1] >= _TRANSPOSED:
+        problem = 'is transposed, or an image of ranges; a point is a row: save its .T'
+        raise PointCloudError(f'array of shape {table.shape}: {problem}')
     return name_columns(table)
-
-
-def _shapes(arrays: Columns) -> str:
-    """Name and shape of each array, cut where they are many."""
-    found = ', '.join(f'{name} {values.shape}' for name, values in arrays.items()) or 'none'
-    return textwrap.shorten(found, 200, placeholder=' ...')
 
 
 def _encode_npy(cloud: Cloud) -> bytes:

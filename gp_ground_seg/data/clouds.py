@@ -67,7 +67,7 @@ def cloud_of(fields: Fields, header: Any = None) -> Cloud:
     names = coordinate_names(known)
     for name in names:
         if name not in known or fields.dtype[name].kind not in 'fiu':
-            found = ', '.join(known) or 'none'
+            found = ', '.join(f'{k} {fields.dtype[k]}' for k in known) or 'none'
             raise PointCloudError(
                 f'no field {name.lower()} of one number per point; fields: {found}'
             )
@@ -160,7 +160,7 @@ def split_header(data: bytes, last: str) -> tuple[list[str], bytes]:
     head = data[:_MAX_HEADER_BYTES]
     found = re.search(rf'^{last}\b.*\n'.encode(), head, re.IGNORECASE | re.MULTILINE)
     if found is None:
-        raise PointCloudError(f'no {last} line of a header in it')
+        raise PointCloudError(f'no {last} line of a header in it; it begins with {data[:20]!r}')
     text = head[: found.end()].decode('utf-8-sig', errors='backslashreplace')
     lines = [line.strip() for line in text.split('\n')]
     return [line for line in lines if line], data[found.end() :]

@@ -43,6 +43,8 @@ def read_bytes(path: str | Path, most: int, expected: str = '') -> bytes:
     if max(size, len(data)) > most:
         expected = expected or f'accepted are at most {most}'
         raise DataError(f'{path}: {max(size, len(data))} bytes, {expected}')
+    if data.startswith(b'version https://git-lfs'):
+        raise DataError(f'{path}: stands for the file in Git LFS: `git lfs pull` fetches it')
     return data
 
 
@@ -64,10 +66,8 @@ def naming(place: str | Path, what: str = '') -> Iterator[None]:
         yield
     except PointCloudError as error:
         raise DataError(f'{place}: {error}') from error
-    except GroundSegError:
-        raise
     except Exception as error:  # Of many types: struct.error, zlib.error, sqlite3, lz4, ...
-        if not what:
+        if not what or isinstance(error, GroundSegError):
             raise
         said = f'{type(error).__name__}: {in_one_line(error)}'
         raise DataError(f'{place}: {what} ({said})') from error

@@ -113,18 +113,19 @@ def _types_of(names: list[str], entries: dict[str, list[str]]) -> list[tuple[str
 
 def _read_compressed(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
     """Read a body: its size, that unpacked, and field after field without padding."""
-    packed, size = struct.unpack_from('<II', data)
+    packed, size = struct.unpack('<II', data[:8].ljust(8, b'\0'))
     needed = n_points * dtype.itemsize
     if size != needed:
         raise PointCloudError(f'body of {size} bytes, its header says {needed}')
-    body = data[8 : 8 + packed]
-    if size > _MAX_EXPANSION * len(body):
-        raise PointCloudError(f'{len(body)} packed bytes cannot hold the {size} of its header')
-    # LZF knows no empty text.
-    body = require('lzf', 'python-neo-lzf').decompress(body, size) if size else b''
+    body, unpacked = data[8 : 8 + packed], b''
+    if 0 < size <= _MAX_EXPANSION * len(body):
+        unpacked = require('lzf', 'python-neo-lzf').decompress(body, size) or b''
+    if len(unpacked) < size:
+        problem = f'{len(body)} packed bytes cannot hold the {size} of its header; truncated?'
+        raise PointCloudError(problem)
     fields, start = np.empty(n_points, dtype), 0
     for name in dtype.names or ():
-        column = np.frombuffer(body, np.dtype([(name, dtype[name])]), n_points, start)
+        column = np.frombuffer(unpacked, np.dtype([(name, dtype[name])]), n_points, start)
         fields[name] = column[name]
         start += column.nbytes
     return fields

@@ -14,7 +14,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud
+from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud, storage_of
 from gp_ground_seg.data.cloud_files import encode_output
 from gp_ground_seg.data.files import changed_at, naming, read_bytes, remove_leftovers, write_file
 from gp_ground_seg.data.inputs import Input
@@ -74,14 +74,15 @@ def write_bag(
 ) -> Iterator[Segmentation]:
     """Write the bag `name` of the clouds of `source`, and yield the result for each.
 
-    It is stored as its suffix says, and appears when the iteration ends. By default `topic` is the
-    only one of PointCloud2. Raises DataError if a cloud cannot be read, or the bag cannot be
-    written.
+    It is stored as its suffix says, else as the input, and appears when the iteration ends. By
+    default `topic` is the only one of PointCloud2. Raises DataError if a cloud cannot be read, or
+    the bag cannot be written.
     """
     target = folder / name
+    storage = storage_of(source).replace('ros1', 'mcap')  # no ROS 1 bag is written
     with BagReader(source) as bag:
         topic = bag.pick_point_cloud_topic(topic)
-        with BagWriter(target, force=True) as output:
+        with BagWriter(target, force=True, storage=storage) as output:
             for part in TOPICS:
                 output.add_topic(part)
             for k, (_, time, raw) in enumerate(bag.messages([topic])):

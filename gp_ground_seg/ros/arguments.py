@@ -17,7 +17,6 @@ from typing import Any
 from gp_ground_seg.core.errors import ConfigError, GroundSegError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import (
-    EMPTY_LIST,
     FORM_OF_ROS,
     ROS_PARAMETERS_KEY,
     read_yaml,
@@ -42,7 +41,6 @@ _RULES = {
     'node namespace': _NAMES,
     'parameter override rule': 'must be NAME:=VALUE, as in sensor.height:=1.2',
     'use_sim_time': 'must be true or false',
-    'PARAMETER_NOT_SET': f'an empty list: {EMPTY_LIST}',
     'severity level': 'must be debug, info, warn, error or fatal, or NAME:= one of them',
     'Enclave name': 'as in /front/lidar',
     'failed to initialize logging': LOG_FOLDER,
@@ -123,14 +121,12 @@ def objections_of_ros(path: str | Path) -> list[str]:
     """Return why ROS's own parser refuses a parameter file; nothing where ROS is not installed."""
     check_middleware()
     try:
-        from rclpy.utilities import remove_ros_args
+        with contextlib.suppress(ImportError), start_errors():
+            from rclpy.utilities import remove_ros_args
 
-        with start_errors():
             remove_ros_args(['', '--ros-args', '--params-file', str(path)])
     except ConfigError as error:
         return [str(error).rpartition('Error: ')[2]]
-    except ImportError:
-        pass
     return []
 
 
@@ -141,9 +137,8 @@ def _parameter_files(words: Sequence[str]) -> list[str]:
 def with_file(problem: str, words: Sequence[str]) -> str:
     """Return a problem of the parameters, after the last of the files `words` that has it."""
     for path in reversed(_parameter_files(words)):
-        for found in Config.problems_of_file(path):
-            if found == problem or (EMPTY_LIST in found and EMPTY_LIST in problem):
-                return f'{path}: {found}'
+        if problem in Config.problems_of_file(path):
+            return f'{path}: {problem}'
     return problem
 
 
@@ -165,6 +160,6 @@ def unused_files(words: Sequence[str], node_name: str) -> list[str]:
 
 def _is_of_node(key: str, node_name: str) -> bool:
     """Whether rclpy gives the parameters of `key` to a node: ``*`` is any word, ``**`` several."""
-    rooted = key if key.startswith('/') else f'/{key}'
+    rooted = f'/{key.removeprefix("/")}'
     # rcl has accepted the key: apart from * it has letters, digits, _ and / only.
     return re.fullmatch(rooted.replace('/*', r'(/\w+)'), node_name) is not None

@@ -80,7 +80,6 @@ class CloudSubscription:
     """Why no clouds were wanted at the last review; empty if they were."""
     _subscription: Any = None
     _reliability = ReliabilityPolicy.UNKNOWN
-    _number: int | None = None  # that the publisher of the newest cloud has given it
     _size = 0  # of the newest cloud [bytes]
     _newest_stamp = -math.inf  # since the last jump [s]
 
@@ -99,6 +98,7 @@ class CloudSubscription:
         # How old the stamps of the newest clouds were when these were sent [s].
         self._ages: deque[float] = deque(maxlen=AGE_WINDOW)
         self._offered: dict[bytes, ReliabilityPolicy] = {}
+        self._numbers: list[int] = []  # that publishers have given their newest clouds
         self._foreign: set[str] = set()  # types of other messages that are sent on the topic
         self._logged: set[str] = set()  # first words of the faults that were logged
         self._unresolved_topic = topic
@@ -172,14 +172,20 @@ class CloudSubscription:
         """Return how many clouds are missing before the one with this `number`.
 
         They were lost on the way, or overwritten in a full queue while the node was busy. Each
-        publisher numbers its own, and rclpy does not name it: of several no loss is known.
+        publisher numbers its own, and rclpy does not name it: it is the one that is next below.
         """
         if not self._offered:
             self._look_at_publishers()
-        last, self._number = self._number, number
-        if number is None or last is None or self.n_publishers > 1:
+        if number is None:
+            self._numbers.clear()
             return 0
-        n_lost = max(0, number - last - 1)
+        known = self._numbers
+        last = max((own for own in known if own < number), default=None)
+        if last is None or (len(known) < self.n_publishers and last < number - 1):
+            self._numbers = [*known, number][-max(1, self.n_publishers) :]
+            return 0
+        known[known.index(last)] = number
+        n_lost = number - last - 1
         # Of another publisher, if they have changed.
         return 0 if n_lost and self._look_at_publishers() else n_lost
 
@@ -205,7 +211,7 @@ class CloudSubscription:
         }
         is_changed = self._offered.keys() != before
         if is_changed:
-            self._number = None
+            self._numbers.clear()
         return is_changed
 
     def _every_second(self) -> None:
@@ -229,7 +235,8 @@ class CloudSubscription:
         if is_listening:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
-        self._reliability, self._size, self._number = wanted, 0, None
+        self._reliability, self._size = wanted, 0
+        self._numbers.clear()
         words = f'not listening to {self.topic}: {self.idle}'
         if not self.idle:
             self._subscription = self._node.create_subscription(

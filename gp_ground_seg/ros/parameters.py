@@ -16,7 +16,7 @@ from rclpy.parameter_service import ParameterService
 
 from gp_ground_seg.core.errors import ConfigError, GroundSegError
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.core.parameters.schema import OF_EVERY_NODE, ParameterSpec
+from gp_ground_seg.core.parameters.schema import EMPTY_LIST, OF_EVERY_NODE, ParameterSpec
 from gp_ground_seg.ros.arguments import start_errors
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
 
@@ -74,26 +74,18 @@ class ConfiguredNode(Node):  # type: ignore[misc]
     """
 
     def __init__(self, name: str, **options: Any) -> None:
-        # Declared from the overrides to learn which names were given; then again, typed.
         with start_errors():
-            super().__init__(
-                name,
-                automatically_declare_parameters_from_overrides=True,
-                start_parameter_services=False,
-                **options,
-            )
-        every = self.get_parameters_by_prefix('').items()
+            super().__init__(name, start_parameter_services=False, **options)
+        # What a file or ``-p`` gives: of an empty list or group rcl keeps the name only.
+        every = self._parameter_overrides.items()
         self._given = {name: given for name, given in every if name not in OF_EVERY_NODE}
-        # rclpy logs the error and goes on.
-        use_sim_time = self.get_parameter('use_sim_time').value
-        if not isinstance(use_sim_time, bool):
-            raise ConfigError(f'use_sim_time = {use_sim_time!r}: must be true or false')
-        values = {name: parameter.value for name, parameter in self._given.items()}
+        values = {name: given.value for name, given in self._given.items()}
+        for name, value in values.items():
+            if value is None and not any(known.startswith(f'{name}.') for known in _NAMES):
+                raise ConfigError(f'{name} = []: {EMPTY_LIST}')
         check_overrides(values)
         self._config = changed(Config(), self._given.values())
         self.check_config(self._config)
-        for given in self._given:
-            self.undeclare_parameter(given)
         with start_errors():
             for spec in parameter_specs():
                 value = self._config[spec.name]
@@ -173,9 +165,8 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         if config != self._config:
             self.apply_config(config)
             before, self._config = self._config, config
-            for name, value in config.flat().items():
-                if value != before[name]:
-                    self.get_logger().info(f'{name}: {before[name]} -> {value}')
+            for spec, old, new in before.differences(config):
+                self.get_logger().info(f'{spec.name}: {old} -> {new}')
 
 
 def _typed(parameter: Parameter) -> Parameter:

@@ -193,9 +193,11 @@ READ = [
     *((empty, {}) for empty in ('', '# nothing\n', '{}', f'{IN_ROS} {{}}\n')),
     *(
         (f'observation: {{slope_std: {number}}}', {'observation.slope_std': 0.1})
-        for number in ('1e-1', '1E-1', '.1', '.1e0', '10e-2', '+0.1')
+        for number in ['1e-1', '1E-1', '.1', '.1e0', '10e-2', '+0.1', '0x1.999999999999ap-4']
     ),
-    *((f'grid.n_bins: {number}', {'grid.n_bins': 64}) for number in ('0x40', '0100', '+64')),
+    *((f'grid.n_bins: {n}', {'grid.n_bins': 64}) for n in ('0x40', '0100', '+64', '!!float 64')),
+    *((f'sensor.height: {n}', {'sensor.height': 0.5}) for n in ('0x1p-1', '0X.8', '!!int 0.5')),
+    *((f'sensor.height: {word}', {'sensor.height': 'auto'}) for word in ('"auto"', '!!str auto')),
     *((f'surface.look_aside: {word}', {'surface.look_aside': False}) for word in ('n', 'Off')),
     *((f'frame.base: {word}', {'frame.base': word}) for word in ('2026-11-28', '1_80', 'nul')),
     (f'front:\n  ground_segmentation_node: {{ros__parameters: {{{GIVEN}}}}}', CHANGED),
@@ -205,6 +207,10 @@ READ = [
         CHANGED,
     ),
 ]
+NO_HEIGHTS = {
+    '.inf': 'inf', '-.Inf': '-inf', 'NaN': 'nan', 'yes': 'True', '0x1p9': '512.0', '~': "'~'",
+    '!!float "1.0"': "'1.0'", '1,5': "'1,5'", '!!timestamp 2001-01-01': "'2001-01-01'",
+}  # fmt: skip
 VERDICTS = [
     *READ,
     ('label: {ground_tolerence: 1.0}', 'did you mean label.ground_tolerance?'),
@@ -217,8 +223,15 @@ VERDICTS = [
     ),
     *(
         (f'grid.n_bins: {word}', f"grid.n_bins = '{word}': must be an integer")
-        for word in ('1_80', '1:20', '0b1000000', '0o100', '2011-02-03', 'x')
+        for word in ('1_80', '1:20', '0b1000000', '0o100', '2011-02-03', 'x', '190:20:30')
     ),
+    *(
+        (f'sensor.height: {word}', f'sensor.height = {value}: must be auto or a number in [-5')
+        for word, value in NO_HEIGHTS.items()
+    ),
+    ('grid.n_bins: 08', 'grid.n_bins = 8.0: must be an integer'),
+    ('sensor.height: 0x1p9999', 'not valid YAML: hexadecimal value too large'),
+    ('a: 1\n---\nb: 2', 'not valid YAML: expected a single document'),
     ('label:\n\tground_tolerance: 0.1', "'\\t'"),
     ('sensor: {height: 1.7 m}', "sensor.height = '1.7 m': must be auto or a number"),
     (f'{IN_ROS} {{input.crop_box: [-1, 0.3, -0.4, 0.4, -1, 0.2]}}', 'for ROS: write -1.0'),

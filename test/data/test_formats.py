@@ -12,7 +12,7 @@ from numpy.lib.recfunctions import repack_fields
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.cloud_files import WRITABLE, decode_file, encode_file, read_file
-from gp_ground_seg.data.clouds import cloud_of, gather, name_columns
+from gp_ground_seg.data.clouds import cloud_of, gather
 from gp_ground_seg.data.pcd import PcdHeader
 
 lzf = pytest.importorskip('lzf', reason='needs the extra formats')
@@ -180,22 +180,3 @@ def test_padding_and_fields_of_several_numbers_as_pcl_writes_them():
     np.testing.assert_array_equal(compressed.fields['fpfh'], np.arange(20).reshape(4, 5))
     for cloud in (padded, compressed):
         np.testing.assert_array_equal(cloud.xyz, XYZ)
-
-
-def test_arrays_of_every_kind(tmp_path):
-    xyz = dict(zip('XYZ', np.arange(9.0).reshape(3, 3), strict=True))
-    np.savez(tmp_path / 'fields.npz', **xyz, points=np.arange(3), pose=np.eye(4))
-    np.save(tmp_path / 'fields.npy', gather(xyz))
-    for name in ('fields.npy', 'fields.npz'):
-        np.testing.assert_array_equal(read_file(tmp_path / name).xyz.T, list(xyz.values()))
-    table = np.random.default_rng(1).normal(size=(9, 5))
-    fields = name_columns(table)
-    np.save(tmp_path / 'table.npy', np.asfortranarray(table))
-    assert_fields(read_file(tmp_path / 'table.npy').fields, fields)
-    # The only table is that of the points, whatever it is called.
-    for name in ('points', 'xyzi', 'arr_0'):
-        arrays = {name: table, 'ring': np.arange(9), 'pose': np.eye(3)[0]}
-        np.savez_compressed(tmp_path / 'table.npz', **arrays)
-        found = read_file(tmp_path / 'table.npz').fields
-        assert_fields(found, fields)
-        assert found.dtype.names == ('x', 'y', 'z', 'intensity', 'column_5', 'ring')

@@ -245,13 +245,26 @@ def test_times_of_the_stages_are_logged_at_level_debug(b, tmp_path):
     assert sum(map(float, numbers)) > 0.0
 
 
-def test_a_gap_in_the_numbers_of_one_publisher_is_a_loss(b):
-    """Of another one, which counts from 1, and of a middleware without numbers, none is known."""
-    before = b.node._diagnostics.processing.n_dropped
-    for number in (7, 8, 1, 2, 5, None, 200, None):
-        info = {'publication_sequence_number': number}
-        b.in_executor(b.node._input._receive, to_message(street(50)), info)
-    assert b.node._diagnostics.processing.n_dropped == before + 2
+GAPS = [
+    ((7, 8, 1, 2, 5, None, 200, None), 1, 2),  # another one counts from 1; none has numbers
+    ((50, 1, 51, 2, 3, 54, 7, 8, 55), 2, 5),
+    ((5, 5, 6, 8, 6, 7, 9), 2, 1),
+    ((5, 900, 6, 1, 901, 2, 7, 4, 903), 3, 2),
+]
+
+
+@pytest.mark.parametrize(('numbers', 'n_publishers', 'n_lost'), GAPS)
+def test_a_gap_in_the_numbers_of_a_publisher_is_a_loss(b, numbers, n_publishers, n_lost):
+    source, task = b.node._input, b.node._diagnostics.processing
+    before = task.n_dropped
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(source, '_offered', dict.fromkeys(range(n_publishers)))
+        patch.setattr(source, '_look_at_publishers', lambda: False)
+        patch.setattr(source, '_numbers', [])
+        for number in numbers:
+            info = {'publication_sequence_number': number}
+            b.in_executor(source._receive, to_message(street(50)), info)
+    assert task.n_dropped == before + n_lost
 
 
 def test_the_wait_of_a_cloud_is_a_part_of_its_latency(b, monkeypatch):

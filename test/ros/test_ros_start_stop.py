@@ -27,46 +27,42 @@ HEAD = '/**:\n  ros__parameters:\n'
 # What is wrong at the start is one line with a hint and exit code 2, never a traceback.
 
 FILES = {
-    HEAD + '    label: {ground_tolerance: 9.0}\n': 'd.yaml: label.ground_tolerance = 9.0: must be',
-    HEAD + '    grid: {r_min: 50.0, r_max: 20.0}\n': 'd.yaml: grid.r_min = 50: must be below',
-    HEAD + '    grid: {n_segments: 999999999999999999999}\n': 'must be an integer',
-    HEAD + '    use_sim_time: "yes"\n': 'must be true or false',
-    HEAD + '    grid:\n': 'No value at line 3',
-    HEAD + '    grid: {n_bins: [1, 2.5]}\n': 'd.yaml: grid.n_bins = [1, 2.5]: must have one type',
-    HEAD
-    + '    input.crop_box: [-1, 0.3, 0.0]\n': 'd.yaml: input.crop_box = [-1, 0.3, 0.0]: must h',
-    HEAD
-    + '    input: {crop_box: []}\n': 'd.yaml: input.crop_box = []: ROS does not read an empty',
-    HEAD + '    grid: {n_bins: 1_80}\n': "d.yaml: grid.n_bins = '1_80': must be an integer",
+    **{HEAD + f'    {text}\n': said for text, said in {
+        'label: {ground_tolerance: 9.0}': 'd.yaml: label.ground_tolerance = 9.0: must be',
+        'grid: {r_min: 50.0, r_max: 20.0}': 'd.yaml: grid.r_min = 50: must be below',
+        'grid: {n_segments: 999999999999999999999}': 'must be an integer',
+        'use_sim_time: "yes"': 'must be true or false',
+        'grid:': 'No value at line 3',
+        'grid: {n_bins: [1, 2.5]}': 'd.yaml: grid.n_bins = [1, 2.5]: must have one type',
+        'input.crop_box: [-1, 0.3, 0.0]': 'd.yaml: input.crop_box = [-1, 0.3, 0.0]: must h',
+        'input: {crop_box: []}': 'd.yaml: input.crop_box = []: ROS does not read an empty',
+        'grid: {n_bins: 1_80}': "d.yaml: grid.n_bins = '1_80': must be an integer",
+        'sensor.height: !!float "1.0"': "d.yaml: sensor.height = '1.0': must be auto",
+        'surface.look_aside: 1': 'd.yaml: surface.look_aside = 1: must be true or false',
+        'grid: {n_bins: 40}\n    grid: {n_bins: 50}': 'd.yaml: grid: given twice',
+    }.items()},
+    '/1a:\n  ros__parameters: {}\n': 'node name must not start with a number',
+    'a b:\n  ros__parameters: {}\n': 'node name must not contain characters other than alphanum',
     'a/:\n  ros__parameters: {sensor.height: 1.0}\n': 'node name must not be empty',
     'label: {ground_tolerance: 0.1}\n': 'd.yaml: no ros__parameters, which the node needs',
     '/**:\n  a:\n    grid: {n_bins: 50}\n': 'd.yaml: no ros__parameters',
     'just words\n': 'd.yaml: no ros__parameters',
     HEAD + '  label: [ {a\n': 'd.yaml: not valid YAML',
     '/**:\n\tros__parameters:\n': 'd.yaml: not valid YAML',
-    HEAD + '    grid: {n_bins: 40}\n    grid: {n_bins: 50}\n': 'd.yaml: grid: given twice',
     '\xff\xfe\0\x80': 'd.yaml: not a text file',
-}
+}  # fmt: skip
+NO_RULES = (
+    'points:=/1;2', '__node:=1st', '__node:=', '__node:=a/b', '__ns:=front', '__ns:=/1a',
+    'points:=lidar/', 'points:=~front', 'points:=/1lidar', 'points:=/a//b', 'points:=/front-left',
+    'points=/a',
+)  # fmt: skip
 WORDS = {
     '--params-file nowhere.yaml': 'error: nowhere.yaml: No such file',
     '--params-file .': 'error: .: Is a directory',
     '--params-file': 'No file path provided',
     '-p label.ground_tolerance': "rule: '-p label.ground_tolerance'",
     '-r points': "parse remap rule: '-r points'",
-    **{
-        f'-r {rule}': f"'-r {rule}'. .*: must be OLD:=NEW, of topics such as /front/points: words"
-        for rule in (
-            'points:=/1;2',
-            '__node:=1st',
-            '__ns:=front',
-            '__ns:=/1a',
-            'points:=lidar/',
-            'points:=/1lidar',
-            'points:=/a//b',
-            'points:=/front-left',
-            'points=/a',
-        )
-    },
+    **{f'-r {rule}': f"'-r {rule}'. .*: must be OLD:=NEW, of topics such as" for rule in NO_RULES},
     '-r __ns:=/front/': 'invalid node namespace: .*: must be OLD:=NEW',
     '-p sensor.height:1': "'-p sensor.height:1'.*: must be NAME:=VALUE, as in sensor.height:=1.2",
     '--nonsense': "UnknownROSArgsError: ['--nonsense']",
@@ -74,11 +70,13 @@ WORDS = {
     f'-p {QOS}.reliability:=maybe': 'policy `reliability`: `maybe`',
     f'-p {QOS}.depth:=-3': 'depth = -3: must be an integer in [1, 10000]',
     '-p input.crop_box:=[1.0,0.0,0.0,1.0,0.0,1.0]': 'must be none or six numbers in [-100',
-    '-p input.crop_box:=[]': 'an empty list: ROS does not read an empty list; write none',
-    **{
-        f'ROS_DOMAIN_ID={value}': f'= {value}: must be an integer in [0, 232]'
-        for value in ('999', 'a', '-1')
-    },
+    '-p input.crop_box:=[]': 'error: input.crop_box = []: ROS does not read an empty list; write',
+    '-p x:=[]': 'error: x = []: ROS does not read an empty list; write none',
+    '-p sensor.height:=': "'-p sensor.height:='.*: must be NAME:=VALUE",
+    '-p sensor.height:=1,5': "error: sensor.height = '1,5': must be auto or a number in",
+    '-p label.rule:=rough': "error: label.rule = 'rough': must be one of roughness, tolerance",
+    '-p use_sim_time:=1': 'must be true or false',
+    **{f'ROS_DOMAIN_ID={v}': f'= {v}: must be an integer in [0, 232]' for v in ('999', 'a', '-1')},
     'RCUTILS_COLORIZED_OUTPUT=yes': 'OUTPUT = yes: must be an integer in [0, 1]',
     'RCUTILS_LOGGING_USE_STDOUT=true': 'STDOUT = true: must be an integer in [0, 1]',
     'RCUTILS_LOGGING_BUFFERED_STREAM=2': 'STREAM = 2: must be an integer in [0, 1]',

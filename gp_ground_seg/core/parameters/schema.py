@@ -336,7 +336,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads plain words as ROS's own parser, rcl_yaml_param_parser, does.
+    """Reads values as ROS's own parser, rcl_yaml_param_parser, does: of tags it heeds !!str only.
 
     YAML 1.1 has more: ``1_80`` and ``1:20`` are integers there, ``2026-11-28`` is a date.
     """
@@ -347,7 +347,11 @@ class _Loader(yaml.SafeLoader):
         """Refuse aliases, as ROS does: a kilobyte of them can stand for gigabytes."""
         if self.check_event(yaml.AliasEvent):
             raise ConfigError(f'line {self.line + 1}: aliases (*name) are not accepted')
-        return super().compose_node(parent, index)
+        node = super().compose_node(parent, index)
+        if node is not None and node.tag != self.DEFAULT_SCALAR_TAG:
+            is_plain = getattr(node, 'style', None) not in ('"', "'")
+            node.tag = self.resolve(type(node), node.value, (is_plain, False))  # type: ignore
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Refuse a key that is there twice; the last would win silently."""
@@ -356,22 +360,23 @@ class _Loader(yaml.SafeLoader):
                 raise ConfigError(f'{name}: given twice, line {node.start_mark.line + 1}')
         return super().construct_mapping(node, deep)
 
+    def construct_yaml_float(self, node: yaml.ScalarNode) -> float:
+        """Read also what C reads as hexadecimal, such as 0x1p-3."""
+        is_hex = 'x' in node.value.lower()
+        return float.fromhex(node.value) if is_hex else super().construct_yaml_float(node)
 
-_SWITCHES = 'y', 'yes', 'true', 'on', 'n', 'no', 'false', 'off'
+
+_HEX = r'0[xX]([0-9a-fA-F]+\.?[0-9a-fA-F]*|\.[0-9a-fA-F]+)([pP][-+]?[0-9]+)?'
 _WORDS = {
     'null': '',
-    'bool': '|'.join(f'{word}|{word.capitalize()}|{word.upper()}' for word in _SWITCHES),
+    'bool': '|'.join(f'{w}|{w.capitalize()}|{w.upper()}' for w in _Loader.bool_values),
     'int': '[-+]?(0[0-7]*|[1-9][0-9]{,17}|0x[0-9a-fA-F]{1,15})',
-    'float': r'[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?\.?(?i:inf|nan)',
+    'float': rf'[-+]?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|{_HEX}|\.?(?i:inf|nan))',
 }
 _Loader.yaml_implicit_resolvers = {}
 for _kind, _form in _WORDS.items():
     _Loader.add_implicit_resolver(f'tag:yaml.org,2002:{_kind}', re.compile(rf'({_form})\Z'), None)
-# What launch_ros writes for a list, which rcl reads as one.
-_Loader.add_constructor(
-    'tag:yaml.org,2002:python/tuple',
-    _Loader.construct_sequence,  # type: ignore[type-var]
-)
+_Loader.add_constructor('tag:yaml.org,2002:float', _Loader.construct_yaml_float)
 
 
 def read_yaml(path: str | Path) -> object:

@@ -52,14 +52,14 @@ def take_points(points: npt.ArrayLike, origin: Direction | None = None) -> Point
     if array.ndim != 2 or array.shape[1] < 3:
         raise PointCloudError(
             f'points of shape {array.shape} and type {array.dtype}: must be (N, 3) or wider'
-            f'{reshape_hint(array.shape)}'
+            f'{hint_of_table(array)}'
         )
     if array.shape[0] <= _MOST_ROWS and array.shape[1] >= _LEAST_COLUMNS:
         raise PointCloudError(
             f'points of shape {array.shape}: a point is a row; pass points.T, if they are columns'
         )
     if not np.issubdtype(array.dtype, np.floating):
-        hint = '; pass points.astype(float)' if array.dtype.kind in 'iu' else ''
+        hint = '; pass points.astype(float)' if array.dtype.kind in 'iuO' else ''
         raise PointCloudError(
             f'points of shape {array.shape} and type {array.dtype}: must be floating point{hint}'
         )
@@ -77,10 +77,17 @@ def take_points(points: npt.ArrayLike, origin: Direction | None = None) -> Point
     return xyz
 
 
-def reshape_hint(shape: tuple[int, ...]) -> str:
-    """Return how an image of points, as of a camera or an organised scan, becomes a table."""
-    is_image = len(shape) > 2 and shape[-1] >= 3
-    return f'; an image of points is a table after .reshape(-1, {shape[-1]})' if is_image else ''
+def hint_of_table(array: npt.NDArray[Any]) -> str:
+    """Return how an array becomes a table of points: a structured or flat one, or an image."""
+    shape = array.shape
+    first, last = (shape[0], shape[-1]) if len(shape) > 2 else (0, 0)
+    hints = {
+        "numpy.stack([points[name] for name in 'xyz'], axis=1)": bool(array.dtype.names),
+        '.reshape(-1, COLUMNS)': len(shape) == 1,
+        f'.reshape(-1, {last})': 3 <= last <= _MOST_ROWS,
+        f'.reshape({first}, -1).T': 3 <= first <= _MOST_ROWS,
+    }
+    return next((f'; it is a table after {how}' for how, helps in hints.items() if helps), '')
 
 
 def leave_out_empty_rays(xyz: PointArray, origin: Direction, written: np.dtype[Any]) -> None:
