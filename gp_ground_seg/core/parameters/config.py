@@ -205,7 +205,7 @@ class GrowthConfig(ParameterGroup):
         'largest height of a seed above or below the expected ground; in proportion to the height '
         'of a sensor below 1 m; larger: a ramp near the sensor can be ground, and so can a low '
         'object', 'm')
-    max_std: float = advanced(0.24, (0.001, 10.0),
+    max_std: float = advanced(0.23, (0.001, 10.0),
         'predictive standard deviation above which a candidate is not decided yet, unless it is '
         'as near the prediction; in proportion to the height of a sensor below 1 m', 'm')
     max_standardised_residual: float = advanced(3.0, (0.1, 50.0),
