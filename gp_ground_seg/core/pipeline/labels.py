@@ -29,8 +29,8 @@ from gp_ground_seg.core.pipeline.roughness import ground_roughness
 
 HIGHEST_GROUND = 0.5
 """Height over the surface from which no return is ground, however rough the ground is [m]; returns
-below it tell how rough it is. In proportion to the height of a sensor below 1 m: about a small
-robot, most of what it sees near the ground may be low furniture."""
+below it tell how rough it is. In proportion to the height of a sensor from 1 m down to 0.5 m: about
+a small robot, most of what it sees near the ground may be low furniture."""
 FINEST_UNITS = 2.0**40
 """Most of `sum_units`."""
 ROUGHNESS_IN_BAND = 2.1
@@ -103,7 +103,7 @@ def depth_of_ground(height: float, label: LabelConfig) -> float:
 
 def highest_ground(height: float) -> float:
     """Largest height of rough ground over the surface for a sensor at a `height` [m]."""
-    return min(height, 1.0) * HIGHEST_GROUND
+    return min(max(height, 0.5), 1.0) * HIGHEST_GROUND
 
 
 @shared
