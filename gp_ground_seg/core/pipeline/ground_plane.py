@@ -51,9 +51,11 @@ APART = 0.3
 OTHER_SHARE = 0.05
 """Score of another level, by points off the best one, over that of the best one from which it
 counts: little is seen of a path between platforms, or of the top of a dock."""
-CLEAN, TIGHT = 0.4, 0.9
-"""Share of the support in all evidence, and support over the weights of all points within the
-tolerance, from which another level may be the own one: desks and cars are of many heights."""
+TIGHT = 0.7
+"""Support of another level over the weights of all points within the tolerance, from which it may
+be the own one: desks and cars are of many heights."""
+REFINES = 0.35
+"""Distance to a plane, in tolerances, of the points that refine it: those of one level."""
 OWN = 0.3
 """`asideness` of another level, over that of the best one, below which it is the own one: 0.00 to
 0.27 on paths and docks."""
@@ -98,9 +100,9 @@ class LowestPoints(NamedTuple):
     is_alone: BoolArray  # (C,) whether there are not `N_TOGETHER`, as where noise is the lowest
 
 
-AZIMUTHS = (np.arange(N_SECTORS) + 0.5) * (2.0 * np.pi / N_SECTORS)
+AZIMUTHS = (np.arange(60) + 0.5) * (2.0 * np.pi / 60)
 DIRECTIONS = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
-"""Cosine and sine of each sector, (N_SECTORS, 2)."""
+"""Normals of the sides of a convex hull, (60, 2): a path that is seen far has narrow hulls."""
 
 
 def lowest_points(candidates: Candidates) -> LowestPoints:
@@ -231,9 +233,8 @@ def own_level(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
     if score == 0.0:
         return best, math.inf
     is_on = np.abs(distance(left.x, left.y, left.z, other) * left.inverse) <= 1.0
-    may_be_own = support > TIGHT * RESOLUTION * left.weight[is_on].sum()
-    may_be_own = may_be_own and score > CLEAN * support
-    if may_be_own and asideness(cells, other, best) < OWN * asideness(cells, best, other):
+    is_tight = support > TIGHT * RESOLUTION * left.weight[is_on].sum()
+    if is_tight and asideness(cells, other, best) < OWN * asideness(cells, best, other):
         return refined(left, other, max_slope), best[0]
     return best, other[0]
 
@@ -390,10 +391,12 @@ def distance(x: Values, y: Values, z: Values, plane: Plane) -> Values:
 def support_by(
     x: Values, y: Values, z: Values, inverse: Values, weight: Values, plane: Plane
 ) -> Values:
-    """Support of a plane by a point; a whole number, so that sums are exact in any order."""
-    d = distance(x, y, z, plane) * inverse
-    support = RESOLUTION * weight * (1.0 - d * d)
-    return np.floor(choose(support > 0.0, support, 0.0))
+    """Support of a plane by a point; a whole number, so that sums are exact in any order.
+
+    It is convex in the distance: no plane between two levels has more than both of these.
+    """
+    near = 1.0 - np.abs(distance(x, y, z, plane) * inverse)
+    return np.floor(choose(near > 0.0, RESOLUTION * weight * near * near, 0.0))
 
 
 @shared
@@ -449,8 +452,8 @@ def weighted_moments(cells: LowestPoints, plane: Plane) -> Moments:
 @shared
 def tukey_weight(x: Values, y: Values, z: Values, inverse: Values, plane: Plane) -> Values:
     """Weight of a point by its distance from a plane."""
-    d = distance(x, y, z, plane) * inverse
-    root = 1.0 - 0.5 * d * d
+    d = distance(x, y, z, plane) * inverse / REFINES
+    root = 1.0 - d * d
     root = choose(root > 0.0, root, 0.0) * inverse
     return root * root
 
