@@ -115,27 +115,25 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
     ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
     cell = (candidates.segment[near] * N_SECTORS // n_segments) * N_RINGS + ring
-    order = np.lexsort((z[near], cell))
+    # Cell, height and place as one number: indices take four times as long to sort.
+    bits = len(near).bit_length()
+    n_heights = 2 ** (52 - bits)
+    height = ((z[near] / (2.0 * MAX_Z) + 0.5) * n_heights).astype(np.int64)
+    number = (cell * n_heights + height) * 2**bits + np.arange(len(near))
+    order = np.sort(number) & (2**bits - 1)
     near, cell = near[order], cell[order]
     k = N_TOGETHER - 1
     low, high = near[:-k], near[k:]
     is_together = (cell[:-k] == cell[k:]) & (z[high] - z[low] <= tolerance_at(r[low]))
     first, together = np.flatnonzero(is_new(cell)), np.flatnonzero(is_together)
     together = together[is_new(cell[together])]
-    lowest, is_alone = near[first], np.ones(len(first), dtype=np.bool_)
+    is_alone, chosen = np.ones(len(first), dtype=np.bool_), near[first]
     place = np.searchsorted(cell[first], cell[together])
-    lowest[place], is_alone[place] = near[together], False
-    return cells_of(candidates, cell[first], lowest, near[first], is_alone)
-
-
-def cells_of(
-    candidates: Candidates, cell: IntArray, chosen: IntArray, lowest: IntArray, is_alone: BoolArray
-) -> LowestPoints:
-    """Lowest points of cells: the indices of the `chosen` ones, and of the lowest of all."""
-    x, y, z, r = candidates.x[chosen], candidates.y[chosen], candidates.z, candidates.r[chosen]
-    weight = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
-    inverse = 1.0 / tolerance_at(r)
-    return LowestPoints(x, y, z[chosen], r, inverse, weight, cell, z[lowest], is_alone)
+    chosen[place], is_alone[place] = near[together], False
+    x, y, r = candidates.x[chosen], candidates.y[chosen], candidates.r[chosen]
+    weight, inverse = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r), 1.0 / tolerance_at(r)
+    columns = x, y, z[chosen], r, inverse, weight
+    return LowestPoints(*columns, cell[first], z[near[first]], is_alone)
 
 
 @shared
@@ -327,15 +325,17 @@ def asideness(cells: LowestPoints, own: Plane, other: Plane) -> float:
     d = np.abs(distance(x, y, z, own) * inverse)
     from_other = np.abs(distance(x, y, z, other) * inverse)
     is_own, is_other = (d <= 1.0) & (d <= from_other), (from_other <= 1.0) & (from_other < d)
-    last = len(x) - 1 - int(STRAY * is_own.sum())
-    last_other = len(x) - 1 - int(STRAY * is_other.sum())
-    weight, depth, other_depth = np.where(is_other, cells.weight, 0.0), math.inf, math.inf
+    own_x, own_y, other_x, other_y = x[is_own], y[is_own], x[is_other], y[is_other]
+    if len(own_x) == 0 or len(other_x) == 0:
+        return 1.0
+    last = len(own_x) - 1 - int(STRAY * len(own_x))
+    last_other = len(other_x) - 1 - int(STRAY * len(other_x))
+    weight, depth, other_depth = cells.weight[is_other], math.inf, math.inf
     whole = weight.sum()
     for cosine, sine in DIRECTIONS:
-        along = cosine * x + sine * y
-        reach = ranked(np.where(is_own, along, -math.inf), last)
-        reach_other = ranked(np.where(is_other, along, -math.inf), last_other)
-        depth, other_depth = min(depth, reach), min(other_depth, reach_other)
+        along = cosine * other_x + sine * other_y
+        reach = ranked(cosine * own_x + sine * own_y, last)
+        depth, other_depth = min(depth, reach), min(other_depth, ranked(along, last_other))
         weight[along > max(reach, 0.0)] = 0.0
     return float(weight.sum() / max(whole, 1.0)) + (depth < min(other_depth, 0.0))
 
