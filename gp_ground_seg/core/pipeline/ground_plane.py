@@ -61,9 +61,9 @@ OWN = 0.3
 0.27 on paths and docks."""
 STRAY = 0.05
 """Share of the points of a level that may lie farther in a direction than it reaches."""
-LEVEL_SHARE, STRAIGHT = 0.8, 0.1
-"""Score of the best level plane, over that of one that is tilted by less than `STRAIGHT` [rad],
-from which the tilt explains nothing: shelves on one side and floor on the other."""
+LEVEL, STRAIGHT = 1.15, 0.1
+"""Support of a level plane, by that of a tilted one with as many points: where a level one does as
+well, the tilt explains nothing. Tilt up to which levels are level [rad]: shelves on one side."""
 
 Plane = tuple[float, float, float]
 """Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
@@ -220,7 +220,8 @@ def own_level(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
     It is the plane with the best score, or a parallel one that is not refuted and goes on to where
     the robot stands, as the best one does not.
     """
-    best, best_score = best_level(hypotheses(cells, max_slope), cells)
+    planes = hypotheses(cells, max_slope)
+    best, best_score, _ = best_of(planes, supports_of(planes, cells), cells, 0.0)
     best = refined(cells, best, max_slope)
     # Points of the best plane, and those that lie alone, are of no other level.
     is_left = np.abs(distance(cells.x, cells.y, cells.z, best) * cells.inverse) > 1.0
@@ -235,19 +236,6 @@ def own_level(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
     if is_tight and asideness(cells, other, best) < OWN * asideness(cells, best, other):
         return refined(left, other, max_slope), best[0]
     return best, other[0]
-
-
-@shared
-def best_level(planes: FloatArray, cells: LowestPoints) -> tuple[Plane, float]:
-    """Plane with the best score, and its score: a level one if the tilt explains nothing."""
-    supports = supports_of(planes, cells)
-    best, score, _ = best_of(planes, supports, cells, 0.0)
-    if 0.0 < math.hypot(best[1], best[2]) < STRAIGHT:
-        levels = np.where((planes[:, 1] == 0.0) & (planes[:, 2] == 0.0), supports, 0.0)
-        level, level_score, _ = best_of(planes, levels, cells, LEVEL_SHARE * score)
-        if level_score > 0.0:
-            return level, level_score
-    return best, score
 
 
 @shared
@@ -377,7 +365,7 @@ def supports_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
 def levelness(slope_x: Values, slope_y: Values) -> Values:
     """Fourth power of the cosine of a plane's tilt: a hillside is not better than the valley."""
     square = 1.0 / (1.0 + slope_x * slope_x + slope_y * slope_y)
-    return square * square
+    return choose(square == 1.0, LEVEL, square * square)
 
 
 @shared
