@@ -37,7 +37,7 @@ from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.ros.arguments import initialize, start_errors, unused_files, with_file
 from gp_ground_seg.ros.diagnostics import Diagnostics, by_what_was_set, kept_height
-from gp_ground_seg.ros.input import STEADY_CLOCK, THROTTLED, CloudSubscription
+from gp_ground_seg.ros.input import STEADY_CLOCK, THROTTLED, CloudSubscription, Seldom
 from gp_ground_seg.ros.loader import CHANGED, FOLLOWS, STAYS, BackendLoader
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
@@ -106,6 +106,7 @@ class GroundSegmentationNode(ConfiguredNode):
             )
         self._follow_frames(self.config)
         self._diagnostics = Diagnostics(self, self._input, self.config)
+        Seldom().hold_events(self)
         self.warn_of_unused_parameters()
         self._load_backend(self.config)
         self._input.review()
