@@ -30,7 +30,7 @@ JUMP_TOLERANCE = 0.5  # stamps of several sensors on a topic may be so far out o
 NOTHING_ARRIVES = (
     'qos_overrides asks for reliable, and a publisher offers best effort: nothing arrives from it'
 )
-OPEN = 0.05  # how long in each second events of publishers are looked at [s]
+OPEN = 0.05  # how long in each second what is in a `Seldom` is waited for [s]
 AGE_WINDOW = 10  # clouds over which the median of their age is taken
 MAX_AGE = 1.0  # age of a cloud when it is sent from which on its stamp is of another clock [s]
 NO_TIME = (
@@ -51,7 +51,7 @@ def check_overrides(given: Mapping[str, object]) -> None:
 
 
 class Seldom(ReentrantCallbackGroup):  # type: ignore[misc]
-    """Shows entities to the executor in `OPEN` of each second: each wait for one costs 20 us."""
+    """Shows what is in it to the executor in `OPEN` of each second: a wait for it costs 20 us."""
 
     _until = -math.inf
 
@@ -61,11 +61,6 @@ class Seldom(ReentrantCallbackGroup):  # type: ignore[misc]
         if now > self._until + 1.0 - OPEN:
             self._until = now + OPEN
         return now < self._until
-
-    def hold_events(self, node: Node) -> None:
-        """Take in what warns of subscribers of `node` that ask for another QoS."""
-        for handler in (h for publisher in node.publishers for h in publisher.event_handlers):
-            handler.callback_group = self
 
 
 OnCloud = Callable[[PointCloud2, float, int], None]

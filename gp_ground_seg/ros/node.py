@@ -61,6 +61,7 @@ NO_BOND = (
     'package bond is not installed (apt install ros-jazzy-bond): set bond_timeout: 0.0 on a '
     'lifecycle manager of this node'
 )
+_EVENTS = Seldom()
 _SPEAKER: ContextVar[Node | None] = ContextVar('speaker', default=None)
 """The node whose cloud is segmented in this thread: what the library says then is about it."""
 
@@ -90,6 +91,10 @@ class GroundSegmentationNode(ConfiguredNode):
             self.destroy_node()
             raise
 
+    def create_publisher(self, *what: Any, **options: Any) -> Any:
+        """Make a publisher; its events, which only warn, are waited for seldom."""
+        return super().create_publisher(*what, **{'callback_group': _EVENTS, **options})
+
     def _make_segmenter(self) -> None:
         self._segmenter = GroundSegmenter(self.config, backend=NumpyBackend())
         self._is_compiled = False
@@ -106,7 +111,6 @@ class GroundSegmentationNode(ConfiguredNode):
             )
         self._follow_frames(self.config)
         self._diagnostics = Diagnostics(self, self._input, self.config)
-        Seldom().hold_events(self)
         self.warn_of_unused_parameters()
         self._load_backend(self.config)
         self._input.review()
@@ -378,7 +382,8 @@ def main(args: Sequence[str] | None = None, *, is_managed: bool = False) -> int:
             if node is not None:
                 node.destroy_node()
             rclpy.try_shutdown()
-    if node is not None and node._loader is not None and node._loader.is_alive():
-        # The end of the interpreter would wait for LLVM, for ten seconds and more.
+    if stop.made:
+        # The end of the interpreter would free compiled code, or wait for LLVM, for seconds.
+        sys.stdout.flush()
         os._exit(0)
     return 0
