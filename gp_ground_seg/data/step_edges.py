@@ -47,10 +47,6 @@ window behind it to the end; sectors on each side that the windows take in."""
 ON_SLOPE, MIN_DESCENT = 0.35, 0.02
 """A step is part of a descent if the ground before or behind it has at least this share of its
 slope; least descent to the next ring behind [m]."""
-NEXT_RING = 0.97
-"""The slope behind a step is that to the return whose line of sight has this share of the slope of
-the line of sight at the step."""
-
 N_NEAREST, NEXT, N_FITS = 3, 1.5, 12
 """Rings of the nearest ground that the robot stands on, factor from the range of one to that of
 the next, and rounds of fitting a plane to it."""
@@ -64,7 +60,7 @@ may recede from sector to sector."""
 MIN_STEPS, MIN_WIDTH, MIN_STRONG = 3, 1.0, 0.25
 """Least number of steps of an edge, least width [m], and least share of steps that are larger than
 the largest allowed one."""
-STEEPEST, SHALLOWER = 0.21, 0.85
+STEEPEST, SHALLOWER = 0.21, 0.83
 """A line of sight over an edge tells a drop from a ramp if it is steeper than this slope, of the
 steepest ramp that robots drive, or than this share of the lowest one of the sensor."""
 LEAST_FALL, LEAST_HIDDEN = 0.02, 0.3
@@ -313,12 +309,13 @@ def _steps(returns: _Returns, upper: IntArray, slope: FloatArray, max_step_down:
     *_, far = ground.window(sector[upper], BEHIND * begin, BEHIND**2 * begin)
     behind = np.where(slope_before == 0.0, np.maximum(near, far), np.minimum(near, far))
     roughness = np.maximum(roughness, behind)
-    following, known = _next_ring(returns, lower, NEXT_RING)
-    descent = z[lower] - z[following]
-    goes_on = known & (descent >= ON_SLOPE * slope * (r[following] - r[lower]))
-    goes_on &= descent > N_ROUGHNESS * roughness + MIN_DESCENT
-    # The first ground that is seen leads back, up to the level of the robot.
-    *_, seen, std = ground.window(sector[upper], 0.95 * r[lower], BEHIND**2 * r[lower])
+    # What is seen behind it goes down as well, or leads back up to the level of the robot.
+    goes_on = np.zeros(len(upper), dtype=np.bool_)
+    for end in (BEHIND * r[lower], BEHIND**3 * r[lower], BEHIND**2 * r[lower]):
+        *_, seen, std = ground.window(sector[upper], 0.95 * r[lower], end)
+        descent = -seen * (end - r[lower])
+        is_clear = descent > N_ROUGHNESS * roughness + MIN_DESCENT
+        goes_on |= is_clear & (-seen >= ON_SLOPE * slope)
     leads_back = returns.is_ground[lower] & (seen > -MAX_SLOPE)
     top = z[lower] - seen * r[lower] - N_ROUGHNESS * std  # stairs have a slope, too
     leads_back &= top > z[upper] - max_step_down
@@ -352,22 +349,6 @@ def _is_mirrored(returns: _Returns, upper: IntArray) -> BoolArray:
     first, stop = (np.searchsorted(seen, start[upper] + place) for place in (begin, end))
     result: BoolArray = stop > first
     return result | ((r[before] > begin) & (z[before] < z[upper + 1] - ON_LEVEL))
-
-
-def _next_ring(returns: _Returns, index: IntArray, share: float) -> tuple[IntArray, BoolArray]:
-    """First return of the sector whose line of sight has `share` of the slope of that at `index`.
-
-    Also whether there is one, behind that at `index`, and nothing that stands before it.
-    """
-    elevation = np.arctan(-share * returns.sight[index])
-    level = ((elevation + 0.5 * math.pi) / LEVEL).astype(np.int64)
-    sector, n = returns.sector[index], len(returns.key)
-    place = np.searchsorted(returns.key, sector * N_LEVELS + level, side='right')
-    result = np.minimum(place, n - 1)
-    known = (place < n) & (returns.sector[result] == sector)
-    known &= returns.r[result] > returns.r[index]
-    known &= returns.n_standing[result + 1] <= returns.n_standing[index + 1]
-    return result, known
 
 
 class _Ground(NamedTuple):

@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from itertools import takewhile
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -138,7 +139,9 @@ class ImuListener:
         """
         if not self._messages:
             raise PointCloudError(f'no message on {self.topic}, for frame.level = imu')
-        off, raw = min(((abs(t - stamp), m) for t, m in self._messages), key=itemgetter(0))
+        newest = takewhile(lambda kept: kept[0] > stamp - IMU_TOLERANCE, reversed(self._messages))
+        near = list(newest) or self._messages
+        off, raw = min(((abs(t - stamp), m) for t, m in near), key=itemgetter(0))
         if off > IMU_TOLERANCE:
             raise PointCloudError(
                 f'the nearest orientation on {self.topic} is {off:.3g} s from its stamp: '
