@@ -29,8 +29,8 @@ from gp_ground_seg.core.pipeline.roughness import ground_roughness
 
 HIGHEST_GROUND = 0.5
 """Height over the surface from which no return is ground, however rough the ground is [m]; returns
-below it tell how rough it is. In proportion to the height of a sensor from 1 m down to 0.5 m: about
-a small robot, most of what it sees near the ground may be low furniture."""
+below it tell how rough it is. In proportion to the height of a sensor from 1 m down to 0.5 m: near
+a small robot, most of what is low may be furniture."""
 FINEST_UNITS = 2.0**40
 """Most of `sum_units`."""
 ROUGHNESS_IN_BAND = 2.1

@@ -33,7 +33,7 @@ LITTLE_GROUND = (
     'the scan shows little ground near the sensor, and the height estimated from it may be wrong: '
     'set sensor.height'
 )
-CLEAR_TILT = 0.04
+CLEAR_TILT = 0.045
 """Tilt from which roll and pitch that are auto level the scan [rad]: camber and a vehicle's own
 lean stay below it."""
 LEAST_COSINE = 0.1
