@@ -96,6 +96,19 @@ def test_the_relief_is_that_of_a_bank(backend, degrees):
     assert (relief.at(np.array([-30.0, 5.0]), np.zeros(2)) == 0.0).all()
 
 
+@pytest.mark.parametrize(('at', 'depth'), [(5.0, 1.2), (7.5, 2.0), (10.0, 3.0)])
+def test_land_ends_at_an_edge_and_goes_on_below(backend, at, depth):
+    """What the edge hides is left out: on both sides the relief is that of the land to its end."""
+    candidates = candidates_on(lambda x, y: np.where(x > at, -depth, 0.0), RINGS)
+    seen = at * (HEIGHT + depth) / HEIGHT
+    candidates = candidates.where((candidates.x < at) | (candidates.x > seen))
+    _, over = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
+    is_below = candidates.x > seen
+    assert is_below.sum() > 150
+    np.testing.assert_allclose(over.z[~is_below] + HEIGHT, 0.0, atol=0.01)
+    np.testing.assert_allclose(over.z[is_below] + HEIGHT, 0.0, atol=0.05)
+
+
 def box(x0, x1, y0, y1, high):
     """Level ground with a box on it."""
 
@@ -112,7 +125,6 @@ LEVEL_LAND = {
     'pallets': box(5.0, 9.0, -2.0, 2.0, 0.2),
     'hole': box(8.0, 11.0, 0.0, 4.0, -1.5),
     'terrace': lambda x, y: 1.2 * (x > 9.0),
-    'dock': lambda x, y: -1.2 * (x > 7.5),
 }
 
 

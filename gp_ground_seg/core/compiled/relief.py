@@ -36,6 +36,7 @@ from gp_ground_seg.core.pipeline.relief import (
     arc_of,
     can_step,
     faded,
+    falls,
     from_first_middle,
     goes_on,
     height_in,
@@ -67,27 +68,73 @@ def find_relief(
 
     Where it is, nothing is set.
     """
-    land, is_known = _fit_planes(
-        candidates, reachable(candidates, is_face, height, growth), height
-    )
+    before, behind = reachable(candidates, is_face, height, growth)
+    land, is_known = _fit_planes(candidates, before, height)
+    below, is_known_below = land, np.zeros(_N_SQUARES, np.bool_)
+    if behind.any():
+        below, is_known_below = _fit_planes(candidates, behind, height)
+    if max(_highest(land, is_known), _highest(below, is_known_below)) <= FADED:
+        return True
+    is_behind = np.zeros(_N_SQUARES, np.bool_)
+    if is_known_below.any():
+        is_behind = _behind_of(candidates, before, is_known, behind, is_known_below)
+        _set_pieces(below, is_known_below, is_behind, pieces)
+    _set_pieces(land, is_known, ~is_behind, pieces)
+    for c in range(len(z)):
+        z[c] = candidates.z[c] - height_at(pieces, candidates.x[c], candidates.y[c])
+    return False
+
+
+@jit()
+def _highest(land: FloatArray, is_known: BoolArray) -> float:
+    """Greatest height or depth of the land that is known [m]."""
     highest = 0.0
     for k in range(_N_SQUARES):
         highest = max(highest, abs(land[k])) if is_known[k] else highest
-    if highest <= FADED:
-        return True
+    return highest
+
+
+@jit()
+def _set_pieces(
+    land: FloatArray, is_known: BoolArray, chosen: BoolArray, pieces: FloatArray
+) -> None:
+    """Set the `chosen` ones of the pieces by the land, and let it be known all over."""
     _fill(land, is_known)
     for k in range(_N_SQUARES):
         land[k] = faded(land[k])
     for i in range(N_SIDES - 1):
         for j in range(N_SIDES - 1):
             k = _place(i, j)
-            corners = land[k], land[k + _WIDTH], land[k + 1], land[k + 1 + _WIDTH]
-            level, along_u, along_v, twist = piece_of(*corners)
-            pieces[i, j, 0], pieces[i, j, 1] = level, along_u
-            pieces[i, j, 2], pieces[i, j, 3] = along_v, twist
-    for c in range(len(z)):
-        z[c] = candidates.z[c] - height_at(pieces, candidates.x[c], candidates.y[c])
-    return False
+            if chosen[k]:
+                corners = land[k], land[k + _WIDTH], land[k + 1], land[k + 1 + _WIDTH]
+                level, along_u, along_v, twist = piece_of(*corners)
+                pieces[i, j, 0], pieces[i, j, 1] = level, along_u
+                pieces[i, j, 2], pieces[i, j, 3] = along_v, twist
+
+
+@jit()
+def _behind_of(
+    candidates: Candidates,
+    before: BoolArray,
+    is_known: BoolArray,
+    behind: BoolArray,
+    is_known_below: BoolArray,
+) -> BoolArray:
+    """Which pieces are of the land behind falls, (squares,). See the plain `_is_behind`."""
+    share, is_seen = np.zeros(_N_SQUARES), np.zeros(_N_SQUARES, np.bool_)
+    for c in range(len(before)):
+        x, y = candidates.x[c], candidates.y[c]
+        square = _place(int(square_of(x)), int(square_of(y)))
+        u, v = from_first_middle(x, np.float64), from_first_middle(y, np.float64)
+        piece = _place(int(u), int(v))
+        if before[c] and is_known[square]:
+            share[piece], is_seen[piece] = 1.0, True
+        elif behind[c] and is_known_below[square]:
+            is_seen[piece] = True
+    # Of those without land, all that are as near to land before falls get a share of it.
+    _fill(share, is_seen)
+    result: BoolArray = is_seen & (share == 0.0)
+    return result
 
 
 @jit()
@@ -242,26 +289,33 @@ class _Walk(NamedTuple):
     is_raised: BoolArray  # (C,) candidates that are raised
     part: IntArray  # (C,) as `parent`, by steps between raised candidates alone
     is_entry: BoolArray  # (C,) raised candidates that a step from one that is not leads to
+    is_fallen: BoolArray  # (C,) candidates that a fall leads to
 
 
 @jit()
 def reachable(
     candidates: Candidates, is_face: BoolArray, height: float, growth: GrowthConfig
-) -> BoolArray:
+) -> tuple[BoolArray, BoolArray]:
     """See the plain `reachable`."""
     r, n = candidates.r, len(candidates.r)
     allowed, is_raised = np.empty(n, np.bool_), np.empty(n, np.bool_)
     for c in range(n):
         allowed[c] = r[c] < REACH and not is_face[np.uintp(candidates.tile[c])]
         is_raised[c] = candidates.z[c] + height > RAISED
-    walk = _Walk(_trees(n), is_raised, _trees(n), np.zeros(n, np.bool_))
-    steep = _step_along(candidates, allowed, walk)
+    walk = _Walk(_trees(n), is_raised, _trees(n), np.zeros(n, np.bool_), np.zeros(n, np.bool_))
+    steep, down = _step_along(candidates, allowed, walk)
     for aside in range(1, N_ASIDE + 1):
         _step_aside(candidates, allowed, aside, walk)
     _step_in_front(candidates, steep, walk)
-    is_land: BoolArray = allowed.copy()
+    _step_in_front(candidates, down, walk)
+    is_land = allowed.copy()
     _leave_out_not_entered(candidates, walk, is_land)
     parent, n_seeds = walk.parent, np.zeros(n, np.int64)
+    for c in range(n):
+        if walk.is_fallen[c] and is_land[c] and is_land[c - 1]:
+            _join(parent, c - 1, c)
+        else:
+            walk.is_fallen[c] = False
     for c in range(n):
         parent[c] = _root(parent, c)
         is_near = allowed[c] and r[c] < growth.seed_range
@@ -269,7 +323,23 @@ def reachable(
             n_seeds[parent[c]] += 1
     for c in range(n):
         is_land[c] &= n_seeds[parent[c]] >= MIN_SEEDS
-    return is_land
+    return _sides_of(candidates, is_land, walk.is_fallen)
+
+
+@jit()
+def _sides_of(
+    candidates: Candidates, reached: BoolArray, is_fallen: BoolArray
+) -> tuple[BoolArray, BoolArray]:
+    """Candidates that are `reached`: those before falls, and those behind and below one."""
+    offsets, before, behind = candidates.offsets, reached.copy(), np.zeros_like(reached)
+    for m in range(len(offsets) - 1):
+        edge = -np.inf
+        for c in range(offsets[m], offsets[m + 1]):
+            if is_fallen[c] and reached[c]:
+                edge = candidates.z[c - 1]
+            is_behind = candidates.z[c] < edge - STEEP
+            before[c], behind[c] = reached[c] and not is_behind, reached[c] and is_behind
+    return before, behind
 
 
 @jit()
@@ -302,10 +372,17 @@ def _leave_out_not_entered(candidates: Candidates, walk: _Walk, reached: BoolArr
 
 
 @jit()
-def _step_along(candidates: Candidates, allowed: BoolArray, walk: _Walk) -> IntArray:
-    """Step between neighbours of a segment; return the far ends of the steep and long steps."""
+def _step_along(
+    candidates: Candidates, allowed: BoolArray, walk: _Walk
+) -> tuple[IntArray, IntArray]:
+    """Step between neighbours of a segment.
+
+    Returns the far ends of the steep and long steps, and those of falls and of the steps among the
+    others that lead down.
+    """
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     steep, n = np.empty(len(r), np.int64), 0
+    down, n_down = np.empty(len(r), np.int64), 0
     for m in range(len(offsets) - 1):
         for c in range(offsets[m] + 1, offsets[m + 1]):
             dr, rise = r[c] - r[c - 1], z[c] - z[c - 1]
@@ -318,10 +395,14 @@ def _step_along(candidates: Candidates, allowed: BoolArray, walk: _Walk) -> IntA
                 if is_taken and abs(rise) <= GENTLE:
                     _step(walk, c - 1, c)
                     continue
+            walk.is_fallen[c] = not is_taken and falls(dr, rise)
             if is_taken:
                 steep[n] = c
                 n += 1
-    return steep[:n]
+            if walk.is_fallen[c] or (is_taken and rise < 0.0):
+                down[n_down] = c
+                n_down += 1
+    return steep[:n], down[:n_down]
 
 
 @jit()
@@ -339,7 +420,10 @@ def _goes_on(candidates: Candidates, first: int, c: int) -> bool:
 
 @jit()
 def _step_in_front(candidates: Candidates, steep: IntArray, walk: _Walk) -> None:
-    """Take the steep and long steps in a front; `steep` (S,) are their far ends, in order."""
+    """Take the steep and long steps in a front; `steep` (S,) are their far ends, in order.
+
+    Falls that are not in one are none.
+    """
     offsets, n_segments = candidates.offsets, len(candidates.offsets) - 1
     starts, segment = np.zeros(n_segments + 1, np.int64), np.empty(len(steep), np.int64)
     k = 0
@@ -358,7 +442,10 @@ def _step_in_front(candidates: Candidates, steep: IntArray, walk: _Walk) -> None
         front[k] = _root(front, k)
         width[front[k]] += arc_of(candidates.r[steep[k] - 1], n_segments)
     for k in range(len(steep)):
-        if width[front[k]] >= MIN_WIDTH:
+        is_wide = width[front[k]] >= MIN_WIDTH
+        if walk.is_fallen[steep[k]]:
+            walk.is_fallen[steep[k]] = is_wide
+        elif is_wide:
             _step(walk, steep[k] - 1, steep[k])
 
 

@@ -43,7 +43,8 @@ MAX_SLOPE, STEP_TOLERANCE = 0.84, 0.06
 """Steepest step, of 40 degrees, and what it may rise beyond that by roughness and noise [m]."""
 GENTLE, STEEP, MIN_WIDTH = 0.3, 0.8, 6.0
 """Largest rise or fall of a step; that of one along a segment which is taken where others are side
-by side with it over a width, and this width: more than the length of a car [m]."""
+by side with it over a width, and this width: more than the length of a car [m]. In such a front a
+step may also fall by any height, see `falls`: nothing that stands on the land is below it."""
 LONG_GROWTH, MIN_SLOPE, SAME_SLOPE = 0.4, 0.06, 0.08
 """Growth with range of the longest step along a segment that goes on with the slope of the land
 before it [m/m], in such a front too; least slope of one, and difference to that before."""
@@ -110,7 +111,8 @@ def find_relief(
 ) -> tuple[Relief, Candidates]:
     """Relief of the land over a plane `height` [m] below the origin; candidates over the relief.
 
-    Vertical faces are no land.
+    Vertical faces are no land. What is behind a fall has a relief of its own, so that the land
+    before it is as high up to its edge.
     """
     if not config.surface.look_aside:
         return Relief.level(), candidates
@@ -118,35 +120,77 @@ def find_relief(
     allowed = ~faces.is_face[candidates.tile] & (candidates.r < REACH)
     is_seed = allowed & (candidates.r < growth.seed_range)
     is_seed &= np.abs(over_plane.z) < growth.seed_height_tolerance
-    reached = over_plane.where(reachable(over_plane, allowed, is_seed))
-    land, is_known = fit_planes(reached.x, reached.y, reached.z)
-    if not (np.abs(land[is_known]) > FADED).any():
+    sides = [over_plane.where(side) for side in reachable(over_plane, allowed, is_seed)]
+    lands = [fit_planes(side.x, side.y, side.z) for side in sides if len(side.r)]
+    if not any((np.abs(land[is_known]) > FADED).any() for land, is_known in lands):
         return Relief.level(), candidates
-    relief = Relief.of(faded(filled(land, is_known)))
+    relief = Relief.of(faded(filled(*lands[0])))
+    if len(lands) == 2 and lands[1][1].any():
+        behind = Relief.of(faded(filled(*lands[1])))
+        is_behind = _is_behind(sides, lands)[..., None]
+        relief = Relief(np.where(is_behind, behind.pieces, relief.pieces))
     return relief, candidates._replace(z=candidates.z - relief.at(candidates.x, candidates.y))
 
 
-def reachable(candidates: Candidates, allowed: BoolArray, is_seed: BoolArray) -> BoolArray:
-    """Which of the candidates can be reached from enough seeds in steps over `allowed` ones, (C,).
+def _is_behind(sides: list[Candidates], lands: list[tuple[FloatArray, BoolArray]]) -> BoolArray:
+    """Which pieces of the relief are nearer to land behind falls than to land before them.
+
+    As a mask, (N_SIDES - 1, N_SIDES - 1). Pieces with land of both are of that before.
+    """
+    from scipy.ndimage import distance_transform_cdt
+
+    rings = np.full((2, N_SIDES - 1, N_SIDES - 1), N_SIDES, dtype=np.int32)
+    for ring, side, (_, is_known) in zip(rings, sides, lands, strict=True):
+        known = is_known[square_of(side.x).astype(np.int64), square_of(side.y).astype(np.int64)]
+        u, v = (
+            from_first_middle(place[known], np.float64).astype(np.int64)
+            for place in (side.x, side.y)
+        )
+        is_empty = np.ones(ring.shape, dtype=np.bool_)
+        is_empty[u, v] = False
+        if len(u):
+            distance_transform_cdt(is_empty, 'chessboard', distances=ring)
+    result: BoolArray = rings[1] < rings[0]
+    return result
+
+
+def reachable(
+    candidates: Candidates, allowed: BoolArray, is_seed: BoolArray
+) -> tuple[BoolArray, BoolArray]:
+    """Which of the candidates can be reached from enough seeds in steps over `allowed` ones.
 
     Gentle steps are taken in any case, steep and long ones where they form a front, side by side:
-    those to a car are few. Heights of the candidates are over the plane near the sensor.
+    those to a car are few. Falls form one with steps that lead down, and lead from land only: what
+    is seen over a hedge is below its top. Heights of the candidates are over the plane near the
+    sensor.
+
+    Returns those before falls in their segment, and those behind and below one, two (C,): across a
+    ditch the land is that before it.
     """
-    first, second = _steps(candidates)
+    first, second, is_fall = _steps(candidates)
     taken = allowed[first] & allowed[second]
-    first, second = first[taken], second[taken]
+    first, second, is_fall = first[taken], second[taken], is_fall[taken]
     is_along = second == first + 1
     taken = np.abs(candidates.z[second] - candidates.z[first]) <= GENTLE
     dr = candidates.r[second] - candidates.r[first]
     taken &= ~is_along | (dr <= largest_gap(candidates.r[second]))
     wanting = np.flatnonzero(~taken)
-    taken[wanting] = _in_front(candidates, first[wanting])
-    first, second = first[taken], second[taken]
-    is_land = _entered(candidates, allowed, first, second)
-    group = _groups(len(allowed), first, second)
+    leads_down = candidates.z[second] < candidates.z[first]
+    for wanted in (wanting[~is_fall[wanting]], wanting[leads_down[wanting]]):
+        taken[wanted] |= _in_front(candidates, first[wanted])
+    is_way_up = taken & ~is_fall
+    is_land = _entered(candidates, allowed, first[is_way_up], second[is_way_up])
+    taken &= ~is_fall | (is_land[first] & is_land[second])
+    group = _groups(len(allowed), first[taken], second[taken])
     is_reached = (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
-    result: BoolArray = is_land & is_reached
-    return result
+    is_fallen = np.zeros(len(allowed), dtype=np.bool_)
+    is_fallen[second[taken & is_fall]] = True
+    is_fallen &= is_reached
+    number = np.cumsum(is_fallen)
+    edge = np.append(0, np.flatnonzero(is_fallen))[number] - 1
+    is_behind = number > np.append(0, number)[candidates.offsets][candidates.segment]
+    is_behind &= candidates.z < candidates.z[edge] - STEEP
+    return is_land & is_reached & ~is_behind, is_land & is_reached & is_behind
 
 
 def _entered(
@@ -208,8 +252,8 @@ def _groups(n: int, first: IntArray, second: IntArray) -> IntArray:
     return group
 
 
-def _steps(candidates: Candidates) -> tuple[IntArray, IntArray]:
-    """Candidates at both ends of all possible steps.
+def _steps(candidates: Candidates) -> tuple[IntArray, IntArray, BoolArray]:
+    """Candidates at both ends of all possible steps, and which of them are falls.
 
     They lead to the next candidate of the segment, and to the two in range next to it in each
     segment beside; there none is steep or long. A long step is compared with the slope from the
@@ -227,8 +271,9 @@ def _steps(candidates: Candidates) -> tuple[IntArray, IntArray]:
         is_long = has_before & (dr <= longest_gap(r[1:])) & goes_on(rise / dr, slope_before)
     is_step = (dr <= largest_gap(r[1:])) & can_step(dr, rise, STEEP)
     is_step |= is_long & (dr > largest_gap(r[1:]))
-    is_step &= segment[1:] == segment[:-1]
-    first, second = [along[is_step]], [along[is_step] + 1]
+    is_fall = ~is_step & falls(dr, rise)
+    is_step = (is_step | is_fall) & (segment[1:] == segment[:-1])
+    first, second, is_fall = [along[is_step]], [along[is_step] + 1], is_fall[is_step]
     for aside in range(1, N_ASIDE + 1):
         beside = (segment + aside) % n_segments
         behind = np.searchsorted(key, beside * apart + r)
@@ -240,7 +285,8 @@ def _steps(candidates: Candidates) -> tuple[IntArray, IntArray]:
             is_step &= can_step(distance, z[there] - z, GENTLE)
             first.append(here[is_step])
             second.append(there[is_step])
-    return np.concatenate(first), np.concatenate(second)
+    near, far = np.concatenate(first), np.concatenate(second)
+    return near, far, np.pad(is_fall, (0, len(near) - len(is_fall)))
 
 
 @shared
@@ -260,6 +306,16 @@ def goes_on(slope: Values, before: Values) -> Values:
     """Whether a step of this slope goes on with that before it."""
     is_slope = (np.abs(slope) >= MIN_SLOPE) & (np.abs(slope) <= MAX_SLOPE)
     return is_slope & (np.abs(slope - before) <= SAME_SLOPE)
+
+
+@shared
+def falls(distance: Values, rise: Values) -> Values:
+    """Whether a step leads down over an edge, by more than a steep one and than level land does.
+
+    What the edge hides is longer than a square, so that no piece has land of both sides.
+    """
+    is_deep = (rise < -STEEP) & (rise < -MIN_SLOPE * distance)
+    return is_deep & (distance > math.sqrt(2.0) * SIDE)
 
 
 @shared
