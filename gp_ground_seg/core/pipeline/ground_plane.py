@@ -51,19 +51,17 @@ APART = 0.3
 OTHER_SHARE = 0.05
 """Score of another level, by points off the best one, over that of the best one from which it
 counts: little is seen of a path between platforms, or of the top of a dock."""
-TIGHT = 0.7
-"""Support of another level over the weights of all points within the tolerance, from which it may
-be the own one: desks and cars are of many heights."""
-REFINES = 0.35
-"""Distance to a plane, in tolerances, of the points that refine it: those of one level."""
+CLEAN, TIGHT = 0.4, 0.9
+"""Share of the support in all evidence, and support over the weights of all points within the
+tolerance, from which another level may be the own one: desks and cars are of many heights."""
 OWN = 0.3
 """`asideness` of another level, over that of the best one, below which it is the own one: 0.00 to
 0.27 on paths and docks."""
 STRAY = 0.05
 """Share of the points of a level that may lie farther in a direction than it reaches."""
-LEVEL, STRAIGHT = 1.15, 0.1
-"""Support of a level plane, by that of a tilted one with as many points: where a level one does as
-well, the tilt explains nothing. Tilt up to which levels are level [rad]: shelves on one side."""
+LEVEL_SHARE, STRAIGHT = 0.8, 0.1
+"""Score of the best level plane, over that of one that is tilted by less than `STRAIGHT` [rad],
+from which the tilt explains nothing: shelves on one side and floor on the other."""
 
 Plane = tuple[float, float, float]
 """Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
@@ -100,9 +98,9 @@ class LowestPoints(NamedTuple):
     is_alone: BoolArray  # (C,) whether there are not `N_TOGETHER`, as where noise is the lowest
 
 
-AZIMUTHS = (np.arange(60) + 0.5) * (2.0 * np.pi / 60)
+AZIMUTHS = (np.arange(N_SECTORS) + 0.5) * (2.0 * np.pi / N_SECTORS)
 DIRECTIONS = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
-"""Normals of the sides of a convex hull, (60, 2): a path that is seen far has narrow hulls."""
+"""Cosine and sine of each sector, (N_SECTORS, 2)."""
 
 
 def lowest_points(candidates: Candidates) -> LowestPoints:
@@ -115,25 +113,27 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
     ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
     cell = (candidates.segment[near] * N_SECTORS // n_segments) * N_RINGS + ring
-    # Cell, height and place as one number: indices take four times as long to sort.
-    bits = len(near).bit_length()
-    n_heights = 2 ** (52 - bits)
-    height = ((z[near] / (2.0 * MAX_Z) + 0.5) * n_heights).astype(np.int64)
-    number = (cell * n_heights + height) * 2**bits + np.arange(len(near))
-    order = np.sort(number) & (2**bits - 1)
+    order = np.lexsort((z[near], cell))
     near, cell = near[order], cell[order]
     k = N_TOGETHER - 1
     low, high = near[:-k], near[k:]
     is_together = (cell[:-k] == cell[k:]) & (z[high] - z[low] <= tolerance_at(r[low]))
     first, together = np.flatnonzero(is_new(cell)), np.flatnonzero(is_together)
     together = together[is_new(cell[together])]
-    is_alone, chosen = np.ones(len(first), dtype=np.bool_), near[first]
+    lowest, is_alone = near[first], np.ones(len(first), dtype=np.bool_)
     place = np.searchsorted(cell[first], cell[together])
-    chosen[place], is_alone[place] = near[together], False
-    x, y, r = candidates.x[chosen], candidates.y[chosen], candidates.r[chosen]
-    weight, inverse = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r), 1.0 / tolerance_at(r)
-    columns = x, y, z[chosen], r, inverse, weight
-    return LowestPoints(*columns, cell[first], z[near[first]], is_alone)
+    lowest[place], is_alone[place] = near[together], False
+    return cells_of(candidates, cell[first], lowest, near[first], is_alone)
+
+
+def cells_of(
+    candidates: Candidates, cell: IntArray, chosen: IntArray, lowest: IntArray, is_alone: BoolArray
+) -> LowestPoints:
+    """Lowest points of cells: the indices of the `chosen` ones, and of the lowest of all."""
+    x, y, z, r = candidates.x[chosen], candidates.y[chosen], candidates.z, candidates.r[chosen]
+    weight = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
+    inverse = 1.0 / tolerance_at(r)
+    return LowestPoints(x, y, z[chosen], r, inverse, weight, cell, z[lowest], is_alone)
 
 
 @shared
@@ -220,8 +220,7 @@ def own_level(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
     It is the plane with the best score, or a parallel one that is not refuted and goes on to where
     the robot stands, as the best one does not.
     """
-    planes = hypotheses(cells, max_slope)
-    best, best_score, _ = best_of(planes, supports_of(planes, cells), cells, 0.0)
+    best, best_score = best_level(hypotheses(cells, max_slope), cells)
     best = refined(cells, best, max_slope)
     # Points of the best plane, and those that lie alone, are of no other level.
     is_left = np.abs(distance(cells.x, cells.y, cells.z, best) * cells.inverse) > 1.0
@@ -232,10 +231,24 @@ def own_level(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
     if score == 0.0:
         return best, math.inf
     is_on = np.abs(distance(left.x, left.y, left.z, other) * left.inverse) <= 1.0
-    is_tight = support > TIGHT * RESOLUTION * left.weight[is_on].sum()
-    if is_tight and asideness(cells, other, best) < OWN * asideness(cells, best, other):
+    may_be_own = support > TIGHT * RESOLUTION * left.weight[is_on].sum()
+    may_be_own = may_be_own and score > CLEAN * support
+    if may_be_own and asideness(cells, other, best) < OWN * asideness(cells, best, other):
         return refined(left, other, max_slope), best[0]
     return best, other[0]
+
+
+@shared
+def best_level(planes: FloatArray, cells: LowestPoints) -> tuple[Plane, float]:
+    """Plane with the best score, and its score: a level one if the tilt explains nothing."""
+    supports = supports_of(planes, cells)
+    best, score, _ = best_of(planes, supports, cells, 0.0)
+    if 0.0 < math.hypot(best[1], best[2]) < STRAIGHT:
+        levels = np.where((planes[:, 1] == 0.0) & (planes[:, 2] == 0.0), supports, 0.0)
+        level, level_score, _ = best_of(planes, levels, cells, LEVEL_SHARE * score)
+        if level_score > 0.0:
+            return level, level_score
+    return best, score
 
 
 @shared
@@ -313,17 +326,15 @@ def asideness(cells: LowestPoints, own: Plane, other: Plane) -> float:
     d = np.abs(distance(x, y, z, own) * inverse)
     from_other = np.abs(distance(x, y, z, other) * inverse)
     is_own, is_other = (d <= 1.0) & (d <= from_other), (from_other <= 1.0) & (from_other < d)
-    own_x, own_y, other_x, other_y = x[is_own], y[is_own], x[is_other], y[is_other]
-    if len(own_x) == 0 or len(other_x) == 0:
-        return 1.0
-    last = len(own_x) - 1 - int(STRAY * len(own_x))
-    last_other = len(other_x) - 1 - int(STRAY * len(other_x))
-    weight, depth, other_depth = cells.weight[is_other], math.inf, math.inf
+    last = len(x) - 1 - int(STRAY * is_own.sum())
+    last_other = len(x) - 1 - int(STRAY * is_other.sum())
+    weight, depth, other_depth = np.where(is_other, cells.weight, 0.0), math.inf, math.inf
     whole = weight.sum()
     for cosine, sine in DIRECTIONS:
-        along = cosine * other_x + sine * other_y
-        reach = ranked(cosine * own_x + sine * own_y, last)
-        depth, other_depth = min(depth, reach), min(other_depth, ranked(along, last_other))
+        along = cosine * x + sine * y
+        reach = ranked(np.where(is_own, along, -math.inf), last)
+        reach_other = ranked(np.where(is_other, along, -math.inf), last_other)
+        depth, other_depth = min(depth, reach), min(other_depth, reach_other)
         weight[along > max(reach, 0.0)] = 0.0
     return float(weight.sum() / max(whole, 1.0)) + (depth < min(other_depth, 0.0))
 
@@ -365,7 +376,7 @@ def supports_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
 def levelness(slope_x: Values, slope_y: Values) -> Values:
     """Fourth power of the cosine of a plane's tilt: a hillside is not better than the valley."""
     square = 1.0 / (1.0 + slope_x * slope_x + slope_y * slope_y)
-    return choose(square == 1.0, LEVEL, square * square)
+    return square * square
 
 
 @shared
@@ -379,12 +390,10 @@ def distance(x: Values, y: Values, z: Values, plane: Plane) -> Values:
 def support_by(
     x: Values, y: Values, z: Values, inverse: Values, weight: Values, plane: Plane
 ) -> Values:
-    """Support of a plane by a point; a whole number, so that sums are exact in any order.
-
-    It is convex in the distance: no plane between two levels has more than both of these.
-    """
-    near = 1.0 - np.abs(distance(x, y, z, plane) * inverse)
-    return np.floor(choose(near > 0.0, RESOLUTION * weight * near * near, 0.0))
+    """Support of a plane by a point; a whole number, so that sums are exact in any order."""
+    d = distance(x, y, z, plane) * inverse
+    support = RESOLUTION * weight * (1.0 - d * d)
+    return np.floor(choose(support > 0.0, support, 0.0))
 
 
 @shared
@@ -440,8 +449,8 @@ def weighted_moments(cells: LowestPoints, plane: Plane) -> Moments:
 @shared
 def tukey_weight(x: Values, y: Values, z: Values, inverse: Values, plane: Plane) -> Values:
     """Weight of a point by its distance from a plane."""
-    d = distance(x, y, z, plane) * inverse / REFINES
-    root = 1.0 - d * d
+    d = distance(x, y, z, plane) * inverse
+    root = 1.0 - 0.5 * d * d
     root = choose(root > 0.0, root, 0.0) * inverse
     return root * root
 
