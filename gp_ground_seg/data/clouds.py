@@ -29,21 +29,14 @@ _NAN_OF_WINDOWS = re.compile(rb'[-+]?(nan\(\w+\)|1\.#(QNAN|SNAN|IND)\w*)', re.IG
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points of one scan.
+    """Points of one scan."""
 
-    Attributes
-    ----------
-    fields : (N,) structured array
-        Every field of the file under its name and in its type; x, y, z [m] among them.
-    xyz : (N, 3) or wider float32 or float64 array
-        Points for `GroundSegmenter.segment`: x, y, z [m], the sensor at the origin; of a ``.bin``
-        scan (N, 4), with the intensity.
-    header : opaque
-        What the file has besides its points, and gets again when it is written; or None.
-    """
-
+    #: (N,) every field of the file under its name and in its type; x, y, z [m] among them
     fields: Fields
+    #: (N, 3) or wider, points for `GroundSegmenter.segment`: x, y, z [m], the sensor at the
+    #: origin; of a ``.bin`` scan (N, 4), with the intensity
     xyz: npt.NDArray[np.floating]
+    #: what the file has besides its points, and gets again when it is written; or None
     header: Any = None
 
     def join(self, columns: Columns) -> Cloud:

@@ -63,24 +63,12 @@ class Blocked(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SegmentedCloud:
-    """A cloud with its labels, and what of it is published under the parameters ``output``.
+    """A cloud with its labels, and what of it is published under the parameters ``output``."""
 
-    Attributes
-    ----------
-    cloud : CloudMessage
-        The input.
-    segmentation : Segmentation
-        Its labels.
-    config : Config
-        Parameters.
-    xyz : array (N, 3) or None
-        Coordinates of all points [m], where they have been read already.
-    """
-
-    cloud: Any
-    segmentation: Segmentation
+    cloud: Any  # the input, a `CloudMessage`
+    segmentation: Segmentation  # its labels
     config: Config
-    xyz: PointArray | None = None
+    xyz: PointArray | None = None  # (N, 3) of all points [m], where they have been read already
 
     @cached_property
     def points(self) -> PointArray:

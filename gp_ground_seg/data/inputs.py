@@ -26,23 +26,12 @@ _OUTPUT = re.compile(r'_ground(_ground|_obstacles|_surface)?$')
 
 @dataclass(frozen=True)
 class Input:
-    """One cloud, not read yet.
+    """One cloud, not read yet."""
 
-    Attributes
-    ----------
-    name : str
-        Unique among its `Inputs`; output is named after it.
-    title : str
-        Name to show: that of the file, or of the bag with the number of the message.
-    path : Path
-        The file, or the bag.
-    read : callable
-        Returns the `Cloud`; raises DataError if it cannot be read, or can be no scan.
-    """
-
-    name: str
-    title: str
-    path: Path
+    name: str  # unique among its `Inputs`; output is named after it
+    title: str  # name to show: that of the file, or of the bag with the number of the message
+    path: Path  # the file, or the bag
+    # returns the `Cloud`; raises DataError if it cannot be read, or can be no scan
     read: Callable[[], Cloud]
 
 

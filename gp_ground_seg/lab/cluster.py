@@ -48,21 +48,11 @@ _Notes = list[tuple[int, str]]  # what the library logs: severity and text
 
 @dataclass(frozen=True)
 class Runner:
-    """Computes blocks of items; by default one after the other, in this process.
+    """Computes blocks of items; by default one after the other, in this process."""
 
-    Attributes
-    ----------
-    bar : callable
-        Makes a progress bar, as tqdm does.
-    client : distributed.Client, optional
-        Of the cluster that computes the blocks.
-    n_workers : int
-        How many there are; 0 in this process.
-    """
-
-    bar: Callable[..., tqdm[Any]] = _NO_BAR
-    client: Any = None
-    n_workers: int = 0
+    bar: Callable[..., tqdm[Any]] = _NO_BAR  # makes a progress bar, as tqdm does
+    client: Any = None  # distributed.Client of the cluster that computes the blocks
+    n_workers: int = 0  # how many there are; 0 in this process
 
     def run(
         self,

@@ -76,7 +76,7 @@ class ConfiguredNode(Node):  # type: ignore[misc]
     def __init__(self, name: str, **options: Any) -> None:
         with start_errors():
             super().__init__(name, start_parameter_services=False, **options)
-        # What a file or ``-p`` gives: of an empty list or group rcl keeps the name only.
+        # What a file or ``-p`` gives (not public): of an empty list or group it has the name.
         every = self._parameter_overrides.items()
         self._given = {name: given for name, given in every if name not in OF_EVERY_NODE}
         values = {name: given.value for name, given in self._given.items()}

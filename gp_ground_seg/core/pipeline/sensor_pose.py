@@ -62,42 +62,26 @@ class MeasuredPose:
 
 @dataclass(frozen=True)
 class SensorPose:
-    """Where the sensor was taken to be; the level frame has its origin and heading.
+    """Where the sensor was taken to be; the level frame has its origin and heading."""
 
-    Attributes
-    ----------
-    height : float
-        Height of the cloud's origin above the ground near it, negative below it [m].
-    roll, pitch : float
-        Fixed-axis angles that turn the sensor frame level, as those of a URDF [rad]:
-        positive roll lifts the left side, positive pitch lowers the nose (REP-103).
-    height_estimated, roll_estimated, pitch_estimated : bool
-        Whether each comes from this scan rather than from the parameters or a default.
-    measured : MeasuredPose or None
-        What the scan says; None if it shows no plane at all.
-    contradictions : tuple of str
-        Parameters that the scan clearly contradicts, a line for each; they are used as given.
-    is_height_default : bool
-        Whether the height is neither given nor shown by the scan.
-    doubts : tuple of str
-        Why a height that comes from this scan may be wrong, a line for each.
-    is_fallback : bool
-        Whether what is not given, and `measured`, are those of an earlier scan.
-    origin : tuple of float
-        Place of the sensor in the frame of the cloud, if it was given [m].
-    """
-
-    height: float
+    height: float  #: of the cloud's origin above the ground near it, negative below it [m]
+    #: fixed-axis angles that turn the sensor frame level, as those of a URDF [rad]: positive roll
+    #: lifts the left side, positive pitch lowers the nose (REP-103)
     roll: float
     pitch: float
+    #: whether each comes from this scan rather than from the parameters or a default
     height_estimated: bool = False
     roll_estimated: bool = False
     pitch_estimated: bool = False
-    measured: MeasuredPose | None = None
+    measured: MeasuredPose | None = None  #: what the scan says; None if it shows no plane at all
+    #: parameters that the scan clearly contradicts, a line for each; they are used as given
     contradictions: tuple[str, ...] = ()
-    is_height_default: bool = False
+    is_height_default: bool = False  #: whether the height is neither given nor shown by the scan
+    #: why a height that comes from this scan may be wrong, a line for each
     doubts: tuple[str, ...] = ()
+    #: whether what is not given, and `measured`, are those of an earlier scan
     is_fallback: bool = False
+    #: place of the sensor in the frame of the cloud, if it was given [m]
     origin: Direction = (0.0, 0.0, 0.0)
 
     @property

@@ -256,19 +256,13 @@ def score_scan(scan: KnownScan, result: MethodResult | Segmentation) -> Rows:
 
 
 class Scores(NamedTuple):
-    """How methods did on the same scans; one frame for what is grouped alike.
+    """How methods did on the same scans; one frame for what is grouped alike."""
 
-    Attributes
-    ----------
-    scans : sums of each scan: `COUNTS`, of `metrics.height_sums`, `OBJECT_COUNTS`, shares;
-        seconds, those of the stages, pose, fit; what a method does not have is NaN
-    rings : `COUNTS` of each ring of a scan
-    objects : `OBJECT_COUNTS` of each scan, by class
-    """
-
+    # sums of each scan: `COUNTS`, of `metrics.height_sums`, `OBJECT_COUNTS`, shares; seconds,
+    # those of the stages, pose, fit; what a method does not have is NaN
     scans: DataFrame
-    rings: DataFrame
-    objects: DataFrame
+    rings: DataFrame  # `COUNTS` of each ring of a scan
+    objects: DataFrame  # `OBJECT_COUNTS` of each scan, by class
 
     @property
     def methods(self) -> list[str]:
