@@ -36,7 +36,7 @@ def test_the_correction_by_hand():
     within = (3.0 * one.var() + 2.0 * other.var()) / 5.0
     whole, k = between + within, 25.0 / 13.0
     ground = (k * (between - within / 5.0) + PRIOR_CELLS * whole) / (k - 1.0 + PRIOR_CELLS)
-    ground += within / 5.0
+    ground = ground * (1.0 + 1.0 / (k - 1.0 + PRIOR_CELLS)) + within / 5.0
     both = e, np.sqrt(ground), np.sqrt(max(whole, ground))
     np.testing.assert_allclose(values[:2, :2], np.full((2, 2, 3), both), atol=1e-6)
     alone = third.mean(), own, np.hypot(own, noise)

@@ -20,7 +20,9 @@ where k is the effective number of cells. Where nearly all returns lie in one ce
 
     G = (k max(B - (C - 1) W / n, 0) + PRIOR_CELLS V) / (k - 1 + PRIOR_CELLS).
 
-The variance of the ground about the corrected surface is G and that of the mean, ``W / n``.
+The spread of few cells is itself uncertain: errors over it follow Student's distribution, of which
+68 % lie within 1.3 with three cells. So G is multiplied by ``1 + 1 / (k - 1 + PRIOR_CELLS)``. The
+variance of the ground about the corrected surface is that, and that of the mean, ``W / n``.
 """
 
 from __future__ import annotations
@@ -125,8 +127,9 @@ def _unbiased_variance(
     B, W / n, V, C and k of the module's docstring.
     """
     own = np.maximum(between - (n_cells - 1.0) * noise_of_mean, 0.0)
-    cell_to_cell = (effective * own + PRIOR_CELLS * whole) / (effective - 1.0 + PRIOR_CELLS)
-    variance: FloatArray = cell_to_cell + noise_of_mean
+    spare = effective - 1.0 + PRIOR_CELLS
+    cell_to_cell = (effective * own + PRIOR_CELLS * whole) / spare
+    variance: FloatArray = cell_to_cell * (1.0 + 1.0 / spare) + noise_of_mean
     return variance
 
 
