@@ -224,7 +224,7 @@ def refusal(view: View, given: FloatArray) -> str:
     roll, pitch = (round(angle, 3) + 0.0 for angle in angles_of(up))
     largest = int(np.argmax(np.abs(up)))
     axis = f'{"-" if up[largest] < 0.0 else ""}{"xyz"[largest]}'
-    tilt = math.degrees(math.acos(min(up[2], 1.0)))
+    tilt = math.degrees(math.acos(np.clip(up[2], -1.0, 1.0)))
     problem = f'z is tilted by {tilt:.0f} degrees' if axis == 'z' else 'z does not point up'
     height = view.plane.height * view.plane.normal[2]
     return (
