@@ -65,12 +65,12 @@ WIDE_TABLE = 'x y z intensity column_5 column_6 ring'
 NESTED = npy(np.zeros(4, [('p', [('x', 'f4'), ('y', 'f4')])]))
 CASES |= {
     'objects.npy': (npy(np.array([{}, 1]), allow_pickle=True), 'Object arrays cannot be'),
-    'shape.npy': (npy_header((9999999999, 3)), r'cannot be read as \.npy \('),
+    'shape.npy': (npy_header((9999999999, 3)), r'\.npy; is it whole\? \('),
     'columns.npy': (npy_header((0, 10**12)), '1000000000000 numbers per point'),
     'turned.npy': (npy(np.zeros((3, 200), 'f4')), r'\(3, 200\): is transposed'),
     'nested.npy': (NESTED, 'no field x of one number per point; fields: p'),
     'flat.npy': (npy(np.arange(9.0)), r'array of shape \(9,\): must be \(N, 3\)'),
-    'shape.npz': (npz(a=npy_header((10**9, 3)) + bytes(10**6)), r'cannot be read as \.npz \('),
+    'shape.npz': (npz(a=npy_header((10**9, 3)) + bytes(10**6)), r'\.npz; is it whole\? \('),
     'names.npz': (npz(a=XYZ, b=XYZ), r'arrays a \(4, 3\), b \(4, 3\):.*; call it points'),
     'open3d.npz': (
         npz(colors=-XYZ, normals=-XYZ, pose=np.eye(4)[:3], positions=XYZ), 'x y z colors normals'

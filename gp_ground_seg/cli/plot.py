@@ -102,13 +102,20 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def numbers(text: str) -> list[int]:
-    """Read numbers of segments; of a ValueError argparse makes a line."""
-    return [int(word) for word in text.split(',')]
+    """Read numbers of segments."""
+    try:
+        return [int(word) for word in text.split(',')]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'{text!r}: must be whole numbers, as 90,91') from None
 
 
 def camera(text: str) -> plotting.Place:
     """Read azimuth, elevation and distance; straight from above no side of a picture is up."""
-    azimuth, elevation, distance = map(float, text.split(','))
-    if not (abs(azimuth) <= 360.0 and abs(elevation) <= 89.0 and 1.0 <= distance <= 1000.0):
-        raise ValueError
+    try:
+        azimuth, elevation, distance = map(float, text.split(','))
+        if not (abs(azimuth) <= 360.0 and abs(elevation) <= 89.0 and 1.0 <= distance <= 1000.0):
+            raise ValueError
+    except ValueError:
+        wanted = 'must be three numbers, up to 360 and 89 degrees, and 1 to 1000 m'
+        raise argparse.ArgumentTypeError(f'{text!r}: {wanted}') from None
     return plotting.camera_at(azimuth, elevation, distance)

@@ -161,7 +161,7 @@ def read_file(path: Path, columns: int = KITTI_COLUMNS) -> Cloud:
 
 def decode_file(path: Path, data: bytes) -> Cloud:
     """Cloud of the data of a file, of the format of `path`; DataError if it cannot be read."""
-    with naming(path, f'cannot be read as {path.suffix}'), np.errstate(all='ignore'):
+    with naming(path, f'cannot be read as {path.suffix}; is it whole?'), np.errstate(all='ignore'):
         fields, header = _READERS[path.suffix.lower()](data)
         check_numbers(count_numbers(fields.dtype))
         return cloud_of(fields, header)

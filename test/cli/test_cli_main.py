@@ -84,12 +84,12 @@ MISTAKES = {
     'plot scan scan.npy -o a.png --labels a.label': 'a.label: 0 bytes, expected 7200 for 1800 poi',
     'plot scan scan.npy -o a.png --labels /no.label': '/no.label: ',
     **{
-        f'plot scan A -o B --camera={camera}': '--camera: invalid camera value'
+        f'plot scan A -o B --camera={camera}': f"--camera: '{camera}': must be three numbers, up"
         for camera in ('90', '90,30', 'a,b,c', '0,90,20', '0,20,0.5', '0,20,nan')
     },
     'plot segment A -o B': 'the following arguments are required: --segment',
-    'plot segment A -o B --segment 1,': "--segment: invalid numbers value: '1,'",
-    'plot segment A -o B --segment 90;91': "--segment: invalid numbers value: '90;91'",
+    'plot segment A -o B --segment 1,': "--segment: '1,': must be whole numbers, as 90,91",
+    'plot segment A -o B --segment 90;91': "--segment: '90;91': must be whole numbers, as 90,91",
     'plot segment scan.npy -o B.png --segment 180': r'segment 180: must be in \[0, 179\]',
     'plot segment scan.npy -o B.png --segment -1': 'segment -1',
     'evaluate many': 'many: no sequences/.*velodyne folder .*; scans without labels need --agai',
