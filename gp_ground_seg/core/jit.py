@@ -180,7 +180,7 @@ def _load(load: Callable[..., Any], folder: Path, checksum: Path, *arguments: An
             _end_turn()  # another process has compiled it meanwhile
             return found
     _begin_turn(folder)
-    log_once(logging.INFO, 'compiling for this processor, which takes 20 to 60 s')
+    log_once(logging.WARNING, 'compiling once for this processor, which takes 20 to 60 s')
     return None
 
 
