@@ -10,7 +10,6 @@ from statistics import median
 from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -30,7 +29,6 @@ JUMP_TOLERANCE = 0.5  # stamps of several sensors on a topic may be so far out o
 NOTHING_ARRIVES = (
     'qos_overrides asks for reliable, and a publisher offers best effort: nothing arrives from it'
 )
-OPEN = 0.05  # how long in each second what is in a `Seldom` is waited for [s]
 AGE_WINDOW = 10  # clouds over which the median of their age is taken
 MAX_AGE = 1.0  # age of a cloud when it is sent from which on its stamp is of another clock [s]
 NO_TIME = (
@@ -48,19 +46,6 @@ def check_overrides(given: Mapping[str, object]) -> None:
         is_depth = name.startswith(QOS_OVERRIDES) and name.endswith('.depth')
         if is_depth and isinstance(value, int) and not 1 <= value <= MAX_DEPTH:
             raise ConfigError(f'{name} = {value}: must be an integer in [1, {MAX_DEPTH}]')
-
-
-class Seldom(ReentrantCallbackGroup):  # type: ignore[misc]
-    """Shows what is in it to the executor in `OPEN` of each second: a wait for it costs 20 us."""
-
-    _until = -math.inf
-
-    def can_execute(self, _entity: object) -> bool:
-        """Return whether the executor may wait for an entity now."""
-        now = time.monotonic()
-        if now > self._until + 1.0 - OPEN:
-            self._until = now + OPEN
-        return now < self._until
 
 
 OnCloud = Callable[[PointCloud2, float, int], None]

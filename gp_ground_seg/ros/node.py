@@ -37,7 +37,7 @@ from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.ros.arguments import initialize, start_errors, unused_files, with_file
 from gp_ground_seg.ros.diagnostics import Diagnostics, by_what_was_set, kept_height
-from gp_ground_seg.ros.input import STEADY_CLOCK, THROTTLED, CloudSubscription, Seldom
+from gp_ground_seg.ros.input import STEADY_CLOCK, THROTTLED, CloudSubscription
 from gp_ground_seg.ros.loader import CHANGED, FOLLOWS, STAYS, BackendLoader
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
@@ -61,7 +61,6 @@ NO_BOND = (
     'package bond is not installed (apt install ros-jazzy-bond): set bond_timeout: 0.0 on a '
     'lifecycle manager of this node'
 )
-_EVENTS = Seldom()
 _SPEAKER: ContextVar[Node | None] = ContextVar('speaker', default=None)
 """The node whose cloud is segmented in this thread: what the library says then is about it."""
 
@@ -90,10 +89,6 @@ class GroundSegmentationNode(ConfiguredNode):
         except BaseException:
             self.destroy_node()
             raise
-
-    def create_publisher(self, *what: Any, **options: Any) -> Any:
-        """Make a publisher; its events, which only warn, are waited for seldom."""
-        return super().create_publisher(*what, **{'callback_group': _EVENTS, **options})
 
     def _make_segmenter(self) -> None:
         self._segmenter = GroundSegmenter(self.config, backend=NumpyBackend())

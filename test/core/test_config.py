@@ -103,6 +103,7 @@ REFUSED = [
     ({'Sensor.height': 1.0}, r'unknown parameter .*sensor\.height\?'),
     ({'grid.rmax': 1.0}, r'unknown parameter .*grid\.r_max\?'),
     ({'qqqqqq': 1.0}, "^unknown parameter 'qqqqqq'$"),
+    ({'sensr': {}}, r'unknown parameter .*sensor\.'),
     ({'label': 0.2}, r"'label' is a group of parameters: label\.rule"),
     ({'grid.r_min': np.nextafter(50, 0), 'grid.r_max': 50.0}, r'first bin .* at least 0\.001 m'),
     ({'grid.n_bins': 1024, 'grid.bin_growth': 3.0}, r'grid\.bin_growth = 3 .* 1\.1e-07 m'),
@@ -162,7 +163,7 @@ def test_forms_agree_and_no_change_but_in_a_copy(config, other):
     config.flat()['label.ground_tolerance'] = config.nested()['label']['ground_tolerance'] = 9.0
     flat = config.flat()
     assert config.replace(**other.flat()) == other
-    assert config.replace() == config
+    assert config.replace() == config.replace(sensor={}) == config
     assert config.flat() == flat
     assert list(flat) == [spec.name for spec in SPECS]
     nested = config.nested()

@@ -237,6 +237,9 @@ class ParameterGroups:
         Raises ConfigError if a name is unknown or the changed configuration is invalid.
         """
         nested: dict[str, Any] = self.nested()
+        for name, given in changes.items():
+            if isinstance(given, Mapping) and not given and name not in nested:
+                self.find_spec(name)  # no group is called so
         for name, value in flatten(changes).items():
             group_name, field_name = self.find_spec(name).name.split('.')
             nested[group_name][field_name] = value
