@@ -36,6 +36,8 @@ from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
 LEAST_GROUND = 0.001
 """Share of the points below which next to nothing of a scan is ground."""
+WITHIN_STD = 0.6827
+"""Share of normally distributed values within one standard deviation of their mean."""
 NO_GROUND = 'next to nothing of the scan is ground: is sensor.height right, and z up?'
 
 _Value = TypeVar('_Value')
@@ -278,9 +280,14 @@ class Segmentation:
     def return_std(self) -> FloatArray:
         """Standard deviation of the height of a ground return, (N,) float64 [m].
 
-        About `ground_z`: surface, roughness and range noise together. NaN without a model.
+        About `ground_z`: surface, roughness and range noise together. NaN without a model. Errors
+        have longer tails than a normal distribution, so that their mean square is too much: it is
+        scaled until as many of the returns called ground are within it as of a normal one.
         """
-        return self._at_points(self.corrected.return_std)
+        std, own = self._at_points(self.corrected.return_std), self.is_ground
+        errors = np.abs(self.height[own]) / std[own]
+        scale = np.quantile(errors, WITHIN_STD) if len(errors) else 1.0
+        return np.maximum(scale * std, self.ground_std)
 
     def _at_points(self, table: FloatArray) -> FloatArray:
         return at_points(self.surface.knots, table, self.grid).astype(np.float64)

@@ -83,7 +83,7 @@ def test_height_and_ground_z_are_of_one_surface(tilt):
 def test_the_defaults_fit_every_sensor_and_errors_are_as_large_as_said(sensor):
     """Every scene once, by exact labels and heights; docs/accuracy.md has more seeds."""
     segmenter = GroundSegmenter()
-    ratios, errors, ranges = [], [], []
+    ratios, errors, ranges, of_returns = [], [], [], []
     for name, scene in DRIVES.items():
         mounted = SENSORS[sensor]
         if mounted.n_columns > 900:  # of the mid-360 a scan is of all its rays
@@ -97,6 +97,7 @@ def test_the_defaults_fit_every_sensor_and_errors_are_as_large_as_said(sensor):
         errors.append((found.ground_z - made.ground_z)[own])
         ratios.append(np.abs(errors[-1]) / found.ground_std[own])
         ranges.append(np.hypot(*made.points[own, :2].T))
+        of_returns.append((np.abs(found.height) / found.return_std)[own])
     ratio = np.concatenate(ratios)
     # With few cells far away, their spread about their own mean was 0.55 to 0.63.
     far = np.concatenate(ranges) > 20.0
@@ -104,6 +105,9 @@ def test_the_defaults_fit_every_sensor_and_errors_are_as_large_as_said(sensor):
     assert 0.60 <= np.mean(ratio <= 1.0) <= 0.80
     assert 0.90 <= np.mean(ratio <= 2.0) <= 0.99
     assert abs(np.median(np.concatenate(errors))) < 0.001
+    of_return = np.concatenate(of_returns)
+    assert 0.66 <= np.mean(of_return <= 1.0) <= 0.78
+    assert 0.94 <= np.mean(of_return <= 2.0) <= 0.98
 
 
 @pytest.mark.parametrize('n_segments', [7, 90, 180])

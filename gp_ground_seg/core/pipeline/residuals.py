@@ -59,7 +59,7 @@ class CorrectedSurface(NamedTuple):
     correction: FloatArray  # what is added to the height that the process gives [m]
     mean: FloatArray  # height of the ground in the level frame [m]
     std: FloatArray  # standard deviation of the height of the ground [m]
-    return_std: FloatArray  # standard deviation of the height of a return from the ground [m]
+    return_std: FloatArray  # root mean square of the height of a return over the ground [m]
 
 
 def correct_surface(
