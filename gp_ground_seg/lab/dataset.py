@@ -14,7 +14,14 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud, storage_of
+from gp_ground_seg.data.bags import (
+    POINT_CLOUD2,
+    BagReader,
+    decode_cloud,
+    encode_cloud,
+    new_bag,
+    storage_of,
+)
 from gp_ground_seg.data.cloud_files import encode_output
 from gp_ground_seg.data.files import changed_at, naming, read_bytes, remove_leftovers, write_file
 from gp_ground_seg.data.inputs import Input
@@ -82,16 +89,15 @@ def write_bag(
     storage = storage_of(source).replace('ros1', 'mcap')  # no ROS 1 bag is written
     with BagReader(source) as bag:
         topic = bag.pick_point_cloud_topic(topic)
-        with BagWriter(target, force=True, storage=storage) as output:
-            for part in TOPICS:
-                output.add_topic(part)
+        topics = dict.fromkeys(TOPICS, POINT_CLOUD2)
+        with new_bag(target, topics, force=True, storage=storage) as write:
             for k, (_, time, raw) in enumerate(bag.messages([topic])):
                 with naming(f'{source}: message {k} of topic {topic}, recorded at {time} ns'):
                     cloud = decode_cloud(raw)
                     result = segmenter.segment(read_xyz(cloud))
                 for part, label in TOPICS.items():
                     kept = select_points(cloud, result.label == label)
-                    output.write(part, time, encode_cloud(kept))
+                    write(part, time, encode_cloud(kept))
                 yield result
 
 

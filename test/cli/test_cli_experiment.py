@@ -9,7 +9,7 @@ from evaluation_samples import write_streets
 
 from gp_ground_seg.cli.evaluate import EXPERIMENTS
 from gp_ground_seg.data import semantic_kitti
-from gp_ground_seg.lab import cluster, experiments
+from gp_ground_seg.lab import cluster, table1
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -36,8 +36,8 @@ def test_tables_and_the_rows_below_them(case, root, tmp_path, capsys, monkeypatc
     fewer = EXPERIMENTS['scenes']._replace(places=(0.0,))
     monkeypatch.setitem(EXPERIMENTS, 'scenes', fewer)
     chosen = {('00', '000000'): (3, 4), ('00', '000001'): (5,)}
-    monkeypatch.setattr(experiments, 'CHOICES', chosen)
-    monkeypatch.setattr(experiments, 'N_REPEATS', 1)
+    monkeypatch.setattr(table1, 'CHOICES', chosen)
+    monkeypatch.setattr(table1, 'N_REPEATS', 1)
     words = [root if word == 'ROOT' else word for word in case.split()]
     own = ['--set', 'grid.n_bins=40', '--json', tmp_path / 'a.json', '--markdown']
     assert run('experiment', *words, *own) == 0
