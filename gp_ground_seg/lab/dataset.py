@@ -14,14 +14,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.bags import (
-    POINT_CLOUD2,
-    BagReader,
-    decode_cloud,
-    encode_cloud,
-    new_bag,
-    storage_of,
-)
+from gp_ground_seg.data.bags import POINT_CLOUD2, decode_cloud, encode_cloud, new_bag, storage_of
 from gp_ground_seg.data.cloud_files import encode_output
 from gp_ground_seg.data.files import changed_at, naming, read_bytes, remove_leftovers, write_file
 from gp_ground_seg.data.inputs import Inputs
@@ -63,12 +56,11 @@ def write_bag(source: Inputs, target: Path, segmenter: GroundSegmenter) -> Itera
     It is stored as its suffix says, else as the input, and appears when the iteration ends.
     Raises DataError if a cloud cannot be read, or the bag cannot be written.
     """
-    path, topic = source.path, str(source.topic)
-    storage = storage_of(path).replace('ros1', 'mcap')  # no ROS 1 bag is written
+    storage = storage_of(source.path).replace('ros1', 'mcap')  # no ROS 1 bag is written
     topics = dict.fromkeys(TOPICS, POINT_CLOUD2)
-    with BagReader(path) as bag, new_bag(target, topics, force=True, storage=storage) as write:
-        for k, (_, time, raw) in enumerate(bag.messages([topic])):
-            with naming(f'{path}: message {k} of topic {topic}, recorded at {time} ns'):
+    with new_bag(target, topics, force=True, storage=storage) as write:
+        for place, time, raw in source.messages():
+            with naming(place):
                 cloud = decode_cloud(raw)
                 result = segmenter.segment(read_xyz(cloud))
             for part, label in TOPICS.items():
