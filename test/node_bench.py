@@ -22,7 +22,6 @@ from gp_ground_seg.cli.demo import FRAME_ID
 from gp_ground_seg.cli.options import progress
 from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_stamp
 from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab.scoring.report import describe_environment, machine_line
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 from gp_ground_seg.ros.node_process import INPUT, OUTPUTS, Link, NodeProcess, private_session
@@ -144,12 +143,10 @@ def measure(clouds, rates, n_frames, ros_args=()):
 
 def read_scans(path, n_wanted, topic):
     """Points of the first scans of a KITTI folder, or of what `segment` takes."""
-    if topic is None and any(path.glob('sequences/*/velodyne')):
-        frames = labelled_frames(path)[:n_wanted]
-        return [frame.points for frame in frames]
-    inputs = list_inputs(path, 4, topic)
-    clouds = [item.read().xyz for item in itertools.islice(inputs, n_wanted)]
-    return [np.column_stack([xyz, np.ones(len(xyz))]).astype(np.float32) for xyz in clouds]
+    folders = sorted(path.glob('sequences/*/velodyne')) or [path]
+    items = (item for folder in folders for item in list_inputs(folder, topic=topic))
+    clouds = [item.read().xyz[:, :3] for item in itertools.islice(items, n_wanted)]
+    return [np.insert(xyz, 3, 1.0, axis=1).astype(np.float32) for xyz in clouds]
 
 
 def main():

@@ -140,9 +140,9 @@ MISTAKES = {
             ('pandas', 'experiment steps kitti'),
             ('tabulate', 'evaluate kitti --markdown'),
             ('pypatchworkpp', 'evaluate kitti --peer patchworkpp'),
-            ('lzf', 'segment packed.pcd -o out.npy'),
         )
     },
+    'lzf! segment packed.pcd -o out.npy': 'lzf is not installed.*pip install python-neo-lzf$',
     'play nowhere.mcap': 'nowhere.mcap: no such file or folder',
     'play scan.npy': r'scan.npy: not a bag; accepted are ROS 1 \.bag, \.mcap, \.db3 and rosbag2',
     'play A --rate 0': "--rate: '0': must be a number, above 0",
