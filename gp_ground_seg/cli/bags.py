@@ -108,18 +108,15 @@ def run_convert(arguments: argparse.Namespace) -> int:
         times = f'{frames[0].time:g} to {frames[-1].time:g} s'
         raise DataError(f'times.txt of sequence {arguments.sequence}: {times}: no stamps of ROS')
     n_points = n_labelled = 0
-    with (
-        new_bag(arguments.output, {TOPIC: POINT_CLOUD2}, force=arguments.force) as write,
-        options.progress('kitti-to-bag', quiet=arguments.quiet)(total=len(frames)) as bar,
-    ):
-        for frame, stamp in zip(frames, stamps, strict=True):
+    progress = options.progress('kitti-to-bag', quiet=arguments.quiet)
+    with new_bag(arguments.output, {TOPIC: POINT_CLOUD2}, force=arguments.force) as write:
+        for frame, stamp in progress([*zip(frames, stamps, strict=True)]):
             points, labels = frame.points, {}
             if frame.labels_path is not None:
                 labels['label'] = frame.semantic.astype(np.uint32)
             write(TOPIC, stamp, encode_cloud(scan_cloud(points, stamp, FRAME_ID, **labels)))
             n_points += len(points)
             n_labelled += len(labels)
-            bar.update()
     n_frames, n_all = options.count(len(frames), 'frame'), options.count(n_points, 'point')
     seconds = 1e-9 * (stamps[-1] - stamps[0])
     facts = f'{n_frames} ({n_labelled} with labels), {n_all}, {seconds:.1f} s'
