@@ -6,7 +6,7 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gp_ground_seg.data.bags import POINT_CLOUD2, BagWriter, encode_cloud, jazzy_types
+from gp_ground_seg.data.bags import POINT_CLOUD2, encode_cloud, jazzy_types, new_bag
 
 START = 1_317_000_000_123_456_789
 PERIOD = 100_000_000
@@ -50,18 +50,23 @@ def string_message(text):
 def write_ros2_bag(path, n_clouds=3, topics=('/points',), silent=(), **changes):
     """Clouds on each topic, a string before every one of them; returns what was written."""
     written = []
-    with BagWriter(path) as bag:
-        for topic in (*topics, *silent):
-            bag.add_topic(topic)
-        bag.add_topic('/note', 'std_msgs/msg/String')
+    kinds = {**dict.fromkeys((*topics, *silent), POINT_CLOUD2), '/note': 'std_msgs/msg/String'}
+    with new_bag(path, kinds) as write:
         for k in range(n_clouds):
             time = START + k * PERIOD
             entries = [('/note', time - 7, string_message(f'cloud {k}'))]
             entries += [(topic, time, encode_cloud(cloud(k, **changes))) for topic in topics]
             for entry in entries:
-                bag.write(*entry)
+                write(*entry)
                 written.append(entry)
     return written
+
+
+def write_clouds(path, raws, start=0):
+    """Messages of one topic, a nanosecond apart."""
+    with new_bag(path, {'/points': POINT_CLOUD2}) as write:
+        for time, raw in enumerate(raws, start):
+            write('/points', time, raw)
 
 
 def write_ros1_bag(path, n_clouds=3, topic='/kitti/velo/pointcloud'):

@@ -15,7 +15,7 @@ import lzf
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
-from gp_ground_seg.data.bags import POINT_CLOUD2, BagWriter, cloud_from_columns, encode_cloud
+from gp_ground_seg.data.bags import POINT_CLOUD2, cloud_from_columns, encode_cloud
 
 XYZ = np.arange(12, dtype='f4').reshape(4, 3)
 RAW = XYZ.tobytes()
@@ -304,9 +304,7 @@ def with_one(**changes):
         points = samples.cloud()
         for name, value in changes.items():
             setattr(points, name, value)
-        with BagWriter(path) as bag:
-            bag.add_topic('/points')
-            bag.write('/points', 0, encode_cloud(points))
+        samples.write_clouds(path, [encode_cloud(points)])
 
     return write
 
@@ -383,10 +381,7 @@ def folder(change):
     """Function that writes a folder of three clouds, its metadata.yaml changed."""
 
     def write(path):
-        with BagWriter(path) as bag:
-            bag.add_topic('/points')
-            for time in range(3):
-                bag.write('/points', time, CLOUD)
+        samples.write_clouds(path, [CLOUD] * 3)
         metadata = path / 'metadata.yaml'
         before = metadata.read_text()
         metadata.write_text(change(before))

@@ -1,7 +1,7 @@
 """Hostile clouds and messages: `make torture`, TORTURE_SCALE=100 for a night.
 
-Each case follows from its number. A test runs a hundred or so of them; a crash or a hang of the
-process is a failure too. With TORTURE_STEP=1 each is a test of its own, which -k can choose.
+Each case follows from its number, and is a test of its own; a crash or a hang of the process is a
+failure too.
 """
 
 import os
@@ -20,6 +20,7 @@ from gp_ground_seg.core.pipeline.points import take_points
 MAX_DIFFERENT = 0.02
 """Share of the points that rounding may decide differently in the two backends: one candidate
 that joins or not changes the labels of its cells."""
+SCALE = float(os.environ.get('TORTURE_SCALE', '1'))
 SPECIAL = [np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-40, -1e-40, 1e-7, 1e7, 3e38, -3e38, 1e300]
 
 
@@ -133,7 +134,8 @@ def segment_or_error(segmenter, points):
         return str(error)
 
 
-def try_cloud(number):
+@pytest.mark.parametrize('number', range(round(1000 * SCALE)))
+def test_clouds(number):
     """Segment a random cloud under random parameters; raise unless what must hold does."""
     rng = np.random.default_rng([2112, number])
     points, config = random_cloud(rng), random_config(rng)
@@ -171,9 +173,19 @@ def damaged_message(rng):
     return bytes(data[: rng.integers(1, len(data) + 1)] if rng.random() < 0.1 else data)
 
 
-def send(number, node, link, clock):
+@pytest.fixture(scope='module')
+def node_and_link(tmp_path_factory):
+    """A node in a process of its own, what talks to it, and a publisher of times."""
+    with linked_process(tmp_path_factory.mktemp('node'), {'use_sim_time': True}) as (node, link):
+        node.wait_until_settled()
+        yield node, link, link.probe.create_publisher(Clock, '/clock', 1)
+
+
+@pytest.mark.parametrize('number', range(round(400 * SCALE)))
+@pytest.mark.filterwarnings('default')
+def test_ros(number, node_and_link):
     """Send a damaged cloud and a time; after ten, a valid cloud must be answered."""
-    rng = np.random.default_rng([17, number])
+    (node, link, clock), rng = node_and_link, np.random.default_rng([17, number])
     link.publisher.publish(damaged_message(rng))
     now = Clock()
     now.clock.sec = int(rng.choice([-(2**31), -5, -1, 0, 2**31 - 1]))
@@ -190,36 +202,3 @@ def send(number, node, link, clock):
     memory = int(Path(f'/proc/{node.popen.pid}/statm').read_text().split()[1]) * 4096
     assert memory < MAX_RSS, f'the node holds {memory / 1e6:.0f} MB'
     assert 'Traceback' not in node.log, node.log.partition('Traceback')[2][:500]
-
-
-def cases(n_cases, n_of_test):
-    """Numbers of the cases of a campaign, so many of them in a test."""
-    stop = max(1, round(n_cases * float(os.environ.get('TORTURE_SCALE', '1'))))
-    step = int(os.environ.get('TORTURE_STEP', n_of_test))
-    numbers = [range(k, min(k + step, stop)) for k in range(0, stop, step)]
-    return pytest.mark.parametrize('numbers', numbers, ids=lambda those: f'from {those.start}')
-
-
-def run_cases(numbers, run_case):
-    """Run every case; fail with a line for each that raises."""
-    failed = []
-    for number in numbers:
-        try:
-            run_case(number)
-        except Exception as error:
-            failed.append(f'case {number}: {type(error).__name__}: {error}')
-    assert not failed, '\n'.join(failed)
-
-
-@cases(1000, 100)
-def test_clouds(numbers):
-    run_cases(numbers, try_cloud)
-
-
-@cases(400, 200)
-@pytest.mark.filterwarnings('default')
-def test_ros(numbers, tmp_path):
-    with linked_process(tmp_path, {'use_sim_time': True}) as (node, link):
-        node.wait_until_settled()
-        clock = link.probe.create_publisher(Clock, '/clock', 1)
-        run_cases(numbers, lambda number: send(number, node, link, clock))

@@ -15,9 +15,9 @@ from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.data.bags import (
     POINT_CLOUD2,
     BagReader,
-    BagWriter,
     cloud_from_columns,
     encode_cloud,
+    new_bag,
 )
 from gp_ground_seg.data.point_cloud2 import CloudMessage
 from gp_ground_seg.data.semantic_kitti import list_frames
@@ -108,19 +108,15 @@ def run_convert(arguments: argparse.Namespace) -> int:
         times = f'{frames[0].time:g} to {frames[-1].time:g} s'
         raise DataError(f'times.txt of sequence {arguments.sequence}: {times}: no stamps of ROS')
     n_points = n_labelled = 0
-    with (
-        BagWriter(arguments.output, force=arguments.force) as bag,
-        options.progress('kitti-to-bag', quiet=arguments.quiet)(total=len(frames)) as bar,
-    ):
-        bag.add_topic(TOPIC)
-        for frame, stamp in zip(frames, stamps, strict=True):
+    progress = options.progress('kitti-to-bag', quiet=arguments.quiet)
+    with new_bag(arguments.output, {TOPIC: POINT_CLOUD2}, force=arguments.force) as write:
+        for frame, stamp in progress([*zip(frames, stamps, strict=True)]):
             points, labels = frame.points, {}
             if frame.labels_path is not None:
                 labels['label'] = frame.semantic.astype(np.uint32)
-            bag.write(TOPIC, stamp, encode_cloud(scan_cloud(points, stamp, FRAME_ID, **labels)))
+            write(TOPIC, stamp, encode_cloud(scan_cloud(points, stamp, FRAME_ID, **labels)))
             n_points += len(points)
             n_labelled += len(labels)
-            bar.update()
     n_frames, n_all = options.count(len(frames), 'frame'), options.count(n_points, 'point')
     seconds = 1e-9 * (stamps[-1] - stamps[0])
     facts = f'{n_frames} ({n_labelled} with labels), {n_all}, {seconds:.1f} s'
@@ -141,10 +137,12 @@ def run_play(arguments: argparse.Namespace) -> int:
             options.progress('play', quiet=arguments.quiet)(total=total) as bar,
         ):
             player = Player(session, topics, arguments.rate, has_clock=arguments.clock)
-            start = player.play(bag, time.monotonic(), bar.update)
+            player.play(bag, bar.update)
             while arguments.loop:
-                start = player.play(bag, start, bar.update)
-            player.wait_until_delivered()
+                player.play(bag, bar.update)
+            # With the publisher the last clouds would be lost.
+            for publisher in player.publishers.values():
+                session.wait_until_delivered(publisher, DELIVERY_TIMEOUT)
     return 0
 
 
@@ -154,27 +152,25 @@ class Player:
     def __init__(
         self, session: Session, topics: list[str], rate: float, *, has_clock: bool
     ) -> None:
-        self._session, self._rate = session, rate
-        self._publishers = {t: session.publisher_of_clouds(t, DEPTH) for t in topics}
+        self._session, self._rate, self._start = session, rate, 0.0
+        self.publishers = {t: session.publisher_of_clouds(t, DEPTH) for t in topics}
         self._tell_time = session.publisher_of_time() if has_clock else None
-        publishers = self._publishers.values()
-        session.wait_for(
-            lambda: all(p.get_subscription_count() for p in publishers), DISCOVERY_TIMEOUT
-        )
+        counts = [publisher.get_subscription_count for publisher in self.publishers.values()]
+        session.wait_for(lambda: all(count() for count in counts), DISCOVERY_TIMEOUT)
 
-    def play(self, bag: BagReader, start: float, on_cloud: Callable[[], object]) -> float:
-        """Play the bag from the monotonic time `start` on; return when the next round starts."""
+    def play(self, bag: BagReader, on_cloud: Callable[[], object]) -> None:
+        """Play the bag, a pause after the last round."""
         first: int | None = None
         elapsed = 0  # in the bag [ns]
-        for topic, recorded, raw in bag.messages(self._publishers):
+        for topic, recorded, raw in bag.messages(self.publishers):
             if first is None:
-                first, start = recorded, max(start, time.monotonic())
+                first, self._start = recorded, max(self._start, time.monotonic())
             # The parts of a split bag may overlap.
             elapsed = max(elapsed, recorded - first)
-            self._wait_until(start + 1e-9 * elapsed / self._rate, first + elapsed)
-            self._publishers[topic].publish(raw)
+            self._wait_until(self._start + 1e-9 * elapsed / self._rate, first + elapsed)
+            self.publishers[topic].publish(raw)
             on_cloud()
-        return start + (1e-9 * elapsed + PAUSE) / self._rate
+        self._start += (1e-9 * elapsed + PAUSE) / self._rate
 
     def _wait_until(self, due: float, recorded: int) -> None:
         """Wait until a monotonic time [s]; at it, the time of the bag is `recorded` [ns]."""
@@ -185,8 +181,3 @@ class Player:
             self._session.sleep(min(SLICE, left))
             if not left:
                 return
-
-    def wait_until_delivered(self) -> None:
-        """Wait until the last clouds are acknowledged: with the publisher they would be lost."""
-        for publisher in self._publishers.values():
-            self._session.wait_until_delivered(publisher, DELIVERY_TIMEOUT)

@@ -14,7 +14,7 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.core.errors import GroundSegError, in_thousands
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud
+from gp_ground_seg.data.bags import POINT_CLOUD2, BagReader, decode_cloud, encode_cloud, new_bag
 from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.point_cloud2 import CloudMessage, read_fields, read_xyz
 from gp_ground_seg.lab.plotting import new_figure, plot_scan_view
@@ -145,17 +145,15 @@ def _write(n_frames: int, path: Path, session: Session) -> None:
     """Write the drive as a bag."""
     scans = f'{options.count(n_frames, "scan")} of a simulated street'
     print(f'[1/3] writing {scans} as a bag; meanwhile the node starts', flush=True)
-    with options.progress('scans')(total=n_frames) as bar, BagWriter(path, force=True) as bag:
-        bag.add_topic(TOPIC)
-        scene, rng = SCENES['urban'](SEED), np.random.default_rng(SEED)
-        for k in range(n_frames):
+    scene, rng = SCENES['urban'](SEED), np.random.default_rng(SEED)
+    with new_bag(path, {TOPIC: POINT_CLOUD2}, force=True) as write:
+        for k in options.progress('scans')(range(n_frames)):
             scan = simulate_scan(scene, HDL_64E, rng, x=SPEED * k * PERIOD)
             stamp = EPOCH * 10**9 + round(k * PERIOD * 1e9)
             label = semantic_kitti_labels(scan.kind).astype(np.uint32)
             cloud = scan_cloud(scan.points, stamp, FRAME_ID, label=label)
-            bag.write(TOPIC, stamp, encode_cloud(cloud))
+            write(TOPIC, stamp, encode_cloud(cloud))
             session.check()
-            bar.update()
 
 
 def _play(bag: BagReader, n_frames: int, session: Session, node: NodeProcess) -> Tally:
@@ -165,11 +163,9 @@ def _play(bag: BagReader, n_frames: int, session: Session, node: NodeProcess) ->
     link.connect(decode_cloud(next(bag.messages([TOPIC]))[2]))
     print('[3/3] sending the scans to the node, and receiving both clouds', flush=True)
     tally = Tally()
-    with options.progress('scans')(total=n_frames) as bar:
-        for _, _, raw in bag.messages([TOPIC]):
-            cloud, started = decode_cloud(raw), time.monotonic()
-            back = link.ask(cloud)
-            tally.add(cloud, back, time.monotonic() - started, node.is_compiled())
-            bar.update()
-            session.sleep(max(0.0, started + PERIOD - time.monotonic()))
+    for _, _, raw in options.progress('scans')(bag.messages([TOPIC]), total=n_frames):
+        cloud, started = decode_cloud(raw), time.monotonic()
+        back = link.ask(cloud)
+        tally.add(cloud, back, time.monotonic() - started, node.is_compiled())
+        session.sleep(max(0.0, started + PERIOD - time.monotonic()))
     return tally

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import inspect
-import itertools
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import partial
@@ -253,6 +252,5 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
     """Labelled frames of the options, grouped by sequence."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]
-    frames = labelled_frames(arguments.root, chosen, options.columns_of(arguments))
-    groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
-    return [frame for _, group in groups for frame in [*group][:: arguments.frame_step or 1]]
+    columns, step = options.columns_of(arguments), arguments.frame_step or 1
+    return labelled_frames(arguments.root, chosen, columns, step)

@@ -9,6 +9,7 @@ import textwrap
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, suppress
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
@@ -77,11 +78,11 @@ CLOUDS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 """Options of every command that reads clouds of any format."""
 
 
-def list_clouds(arguments: argparse.Namespace) -> Inputs:
-    """Return the clouds of the input; DataError if ``--frame`` is none of them."""
-    found = list_inputs(arguments.input, columns_of(arguments), arguments.topic)
+def list_clouds(arguments: argparse.Namespace, source: Path | None = None) -> Inputs:
+    """Return the clouds of the input or another `source`; DataError if ``--frame`` is none."""
+    found = list_inputs(source or arguments.input, columns_of(arguments), arguments.topic)
     if found.topic is not None or not any(scan.path.suffix == '.bin' for scan in found):
-        refuse(arguments, ['columns'], f'is for .bin scans, which {arguments.input} is not')
+        refuse(arguments, ['columns'], f'is for .bin scans, which {found.path} is not')
     frame = getattr(arguments, 'frame', None)
     if frame is not None and not 0 <= frame < len(found):
         raise DataError(f'--frame {frame}: must be 0 to {len(found) - 1} here')

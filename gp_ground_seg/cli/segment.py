@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import statistics
+from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from itertools import chain
@@ -17,7 +18,7 @@ from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.data.bags import BAG_SUFFIXES
 from gp_ground_seg.data.cloud_files import FORMATS, LABELS, format_for
 from gp_ground_seg.data.files import write_file
-from gp_ground_seg.data.inputs import Inputs, holds_bag, list_inputs
+from gp_ground_seg.data.inputs import Inputs, holds_bag
 from gp_ground_seg.data.semantic_kitti import is_root, list_sequences
 from gp_ground_seg.lab.dataset import (
     PARAMETERS,
@@ -27,8 +28,6 @@ from gp_ground_seg.lab.dataset import (
     find_difference,
     find_left,
     segment_block,
-    write_bag,
-    write_scans,
 )
 
 DESCRIPTION = """\
@@ -113,7 +112,7 @@ def _list_items(arguments: argparse.Namespace, target: Path) -> tuple[list[Item]
     if arguments.more:
         return _list_bags(arguments), False
     if holds_bag(source) and form is None:
-        return [_bag_item(source, target.name, arguments)], True
+        return [Item(options.list_clouds(arguments), [target.name], to_bag=True)], True
     if is_root(source):
         return _list_root(arguments), False
     scans = options.list_clouds(arguments)
@@ -123,7 +122,7 @@ def _list_items(arguments: argparse.Namespace, target: Path) -> tuple[list[Item]
     if suffix in FORMATS:
         if form not in (None, suffix):
             raise DataError(f'{target}: ends in .{suffix}, which is not {form}')
-        return [Item(source, [target.name], partial(write_scans, scans, [target.name]))], True
+        return [Item(scans, [target.name])], True
     if suffix and not target.is_dir():
         raise DataError(f'{target}: must be a folder, or end in .{", .".join(FORMATS)}')
     return _scan_items(scans, form), False
@@ -133,20 +132,18 @@ def _scan_items(scans: Inputs, form: str | None, folder: str = '') -> list[Item]
     """List scans, which become files in a folder of the output; a bag is one item."""
     names = [f'{folder}{scan.name}.{format_for(scan.path, form)}' for scan in scans]
     if scans.topic:
-        return [Item(scans.path, names, partial(write_scans, scans, names), len(scans))]
+        return [Item(scans, names)]
     pairs = zip(scans, names, strict=True)
-    return [Item(s.path, [name], partial(write_scans, [s], [name])) for s, name in pairs]
+    return [Item(Inputs(scan.path, [scan]), [name]) for scan, name in pairs]
 
 
 def _list_root(arguments: argparse.Namespace) -> list[Item]:
     """List the scans of a SemanticKITTI root; labels go where its tools look for predictions."""
-    columns = options.columns_of(arguments)
     if arguments.format not in (None, LABELS):
         raise DataError(f'--format {arguments.format}: a KITTI_ROOT gives .label files')
     items = []
     for sequence in list_sequences(arguments.input):
-        folder = Path(arguments.input, 'sequences', sequence)
-        scans = list_inputs(folder, columns, arguments.topic)
+        scans = options.list_clouds(arguments, Path(arguments.input, 'sequences', sequence))
         items += _scan_items(scans, LABELS, f'sequences/{sequence}/predictions/')
     return items
 
@@ -159,18 +156,11 @@ def _list_bags(arguments: argparse.Namespace) -> list[Item]:
         if not holds_bag(path):
             raise DataError(f'{path}: is no bag, of several inputs each must be one')
     names = [_default_output(path).name for path in paths]
-    for name in names:
-        if names.count(name) > 1:
-            raise DataError(f'two of the bags would become {name}')
-    return [_bag_item(*pair, arguments) for pair in zip(paths, names, strict=True)]
-
-
-def _bag_item(path: Path, name: str, arguments: argparse.Namespace) -> Item:
-    """Item of a bag that becomes the bag `name`."""
-    options.refuse(arguments, ['columns'], f'is for .bin scans, which {path} is not')
-    n_clouds = len(list_inputs(path, topic=arguments.topic))
-    write = partial(write_bag, path, name, arguments.topic)
-    return Item(path, [name], write, n_clouds)
+    ((name, n_bags),) = Counter(names).most_common(1)
+    if n_bags > 1:
+        raise DataError(f'two of the bags would become {name}')
+    items = zip(paths, names, strict=True)
+    return [Item(options.list_clouds(arguments, p), [name], to_bag=True) for p, name in items]
 
 
 def _parameters(arguments: argparse.Namespace, config: Config) -> str:

@@ -15,7 +15,7 @@ import os
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -270,65 +270,41 @@ class BagReader(AbstractContextManager['BagReader']):
                 )
 
 
-class BagWriter:
-    """A new rosbag2 bag, in a ``with`` statement; written whole or not at all (`staged_file`).
+@contextmanager
+def new_bag(
+    path: str | Path, topics: Mapping[str, str], *, force: bool = False, storage: str = 'mcap'
+) -> Iterator[Callable[[str, int, bytes | memoryview], None]]:
+    """Write a rosbag2 bag, whole or not at all (`staged_file`).
 
     `path` is a folder as ``ros2 bag record -o`` makes, in a `storage`, or a single file, by its
-    suffix. With `force` a bag of that name is replaced. Raises DataError if the path is taken or
-    cannot be written, MissingDependencyError without rosbags.
+    suffix; `topics` have types of ROS 2 Jazzy. With `force` a bag of that name is replaced. Yields
+    what appends a message: its topic, the time when it was recorded [ns], and CDR bytes. Raises
+    DataError if the path is taken or cannot be written, MissingDependencyError without rosbags.
     """
+    require('rosbags.highlevel', 'rosbags')
+    from rosbags.rosbag2 import StoragePlugin, Writer
 
-    def __init__(self, path: str | Path, *, force: bool = False, storage: str = 'mcap') -> None:
-        require('rosbags.highlevel', 'rosbags')
-        self.path = Path(path)
-        if self.path.suffix == '.bag':
-            raise DataError(f'{path}: only ROS 2 bags are written; use .mcap, .db3 or a folder')
-        self._storage = STORAGE_OF_SUFFIX.get(self.path.suffix, storage)
-        if self._storage == 'sqlite3':
-            check_sqlite_path(self.path)
-        self._force = force
-        self._connections: dict[str, Any] = {}
-
-    def __enter__(self) -> BagWriter:
-        """Create the hidden bag."""
-        from rosbags.rosbag2 import StoragePlugin, Writer
-
-        with ExitStack() as stack:
-            if self.path.suffix in STORAGE_OF_SUFFIX:
-                product = stack.enter_context(staged_file(self.path, force=self._force))
-                # rosbags writes folders; the one file in it is named after the folder.
-                folder = product.parent / 'bag' / product.stem
-                file = folder / f'{folder.name}{self.path.suffix}'
-                stack.push(lambda kind, *_: os.rename(file, product) if kind is None else None)
-            else:
-                folder = stack.enter_context(
-                    staged_file(self.path, force=self._force, is_kind=is_bag_folder)
-                )
-            stack.enter_context(writing(self.path))
-            plugin = StoragePlugin[self._storage.upper()]
-            # Version 9 is what Jazzy writes.
-            self._writer = stack.enter_context(Writer(folder, version=9, storage_plugin=plugin))
-            self._open = stack.pop_all()
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        """Give the bag its name, or remove it after an error."""
-        self._open.__exit__(*error)
-
-    def add_topic(self, name: str, msgtype: str = POINT_CLOUD2) -> None:
-        """Declare a topic of a type of ROS 2 Jazzy, before its first message.
-
-        Without a profile of its own it is played reliably: with best effort large clouds get lost.
-        """
-        with writing(self.path):
-            self._connections[name] = self._writer.add_connection(
-                name, msgtype, typestore=jazzy_types()
-            )
-
-    def write(self, topic: str, time: int, raw: bytes | memoryview) -> None:
-        """Append one message, CDR bytes, to a declared topic with its recorded `time` [ns]."""
-        with writing(self.path):
-            self._writer.write(self._connections[topic], time, raw)
+    path, types = Path(path), jazzy_types()
+    if path.suffix == '.bag':
+        raise DataError(f'{path}: only ROS 2 bags are written; use .mcap, .db3 or a folder')
+    storage = STORAGE_OF_SUFFIX.get(path.suffix, storage)
+    if storage == 'sqlite3':
+        check_sqlite_path(path)
+    is_file = path.suffix in STORAGE_OF_SUFFIX
+    is_kind = Path.is_file if is_file else is_bag_folder
+    with staged_file(path, force=force, is_kind=is_kind) as product, writing(path):
+        # rosbags writes folders; the one file in it is named after the folder.
+        folder = product.parent / 'bag' / product.stem if is_file else product
+        # Version 9 is what Jazzy writes.
+        with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as bag:
+            # Without a profile of its own a topic is played reliably: best effort loses clouds.
+            connections = {
+                name: bag.add_connection(name, kind, typestore=types)
+                for name, kind in topics.items()
+            }
+            yield lambda topic, time, raw: bag.write(connections[topic], time, raw)
+        if is_file:
+            os.rename(folder / f'{folder.name}{path.suffix}', product)
 
 
 def stamp_of(cloud: CloudMessage) -> tuple[int, int]:

@@ -55,13 +55,18 @@ class Inputs:
         """Yield each cloud, not read yet."""
         if self.topic is None:
             yield from self.files
+        for k, (place, _, raw) in enumerate(self.messages()):
+            title = shown(f'{self.path.name}[{k}]')
+            yield Input(f'{k:06d}', title, self.path, partial(_decode, raw, place))
+
+    def messages(self) -> Iterator[tuple[str, int, bytes]]:
+        """Yield what names each cloud of a bag, its recorded time [ns], and its CDR bytes."""
+        if self.topic is None:
             return
         with BagReader(self.path) as bag:
             for k, (_, time, raw) in enumerate(bag.messages([self.topic])):
                 place = f'message {k} of topic {self.topic}, recorded at {time} ns'
-                read = partial(_decode, raw, f'{self.path}: {place}')
-                title = shown(f'{self.path.name}[{k}]')
-                yield Input(f'{k:06d}', title, self.path, read)
+                yield f'{self.path}: {place}', time, raw
 
     def __getitem__(self, index: int) -> Input:
         """Return one cloud, not read yet; IndexError beyond the last."""

@@ -108,9 +108,12 @@ def list_frames(root: str | Path, sequence: str, columns: int = KITTI_COLUMNS) -
 
 
 def labelled_frames(
-    root: str | Path, sequences: Sequence[str] | None = None, columns: int = KITTI_COLUMNS
+    root: str | Path,
+    sequences: Sequence[str] | None = None,
+    columns: int = KITTI_COLUMNS,
+    step: int = 1,
 ) -> list[Frame]:
-    """Frames of the named sequences, or of all that have labels, in order.
+    """Frames of the named sequences, or of all that have labels, in order; each `step`-th of one.
 
     Sequences of SemanticKITTI's test set have none; a note says which are left out. Raises
     DataError if a sequence is not there, a named one or a single frame has no labels, or all.
@@ -124,7 +127,7 @@ def labelled_frames(
         elif bare:
             raise DataError(f'{root}: frames of sequence {name} have no labels, as {bare[0]}')
         else:
-            frames += listed
+            frames += listed[::step]
     if not frames:
         raise DataError(f'{root}: no sequence has labels, of {", ".join(list_sequences(root))}')
     if left_out:

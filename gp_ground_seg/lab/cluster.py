@@ -13,7 +13,7 @@ import platform
 import signal
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import resource_tracker
@@ -74,15 +74,14 @@ class Runner:
         blocks = cut(items, group, self.n_workers)
         compute = partial(_compute_block, __version__, function)
         futures = self.client.map(compute, blocks, pure=False)
-        numbers, found = {future: k for k, future in enumerate(futures)}, [None] * len(blocks)
+        block_of, found = dict(zip(futures, blocks, strict=True)), {}
         with self.bar(total=size_of(items)) as bar:
             for future in as_completed(futures, loop=self.client.loop):
-                block = blocks[k := numbers[future]]
-                found[k], notes = _result_of(future, block)
+                found[future], notes = _result_of(future, block_of[future])
                 for note in notes:
                     log_once(*note)
-                bar.update(size_of(block))
-        return found
+                bar.update(size_of(block_of[future]))
+        return [found[future] for future in futures]
 
 
 def _result_of(future: Any, block: Sequence[Any]) -> Any:
@@ -167,15 +166,14 @@ def _start_workers(n_workers: int) -> Iterator[Any]:
     distributed, dask = _quiet_distributed(), require('dask', PACKAGES)
     require('cryptography', PACKAGES)
     others = multiprocessing.active_children()
-    with ExitStack() as stack:
+    settings: dict[str, Any] = {
         # Without the pages that would show others on this machine what is computed.
-        pages = ('distributed.scheduler.http.routes', 'distributed.worker.http.routes')
+        'distributed.scheduler.http.routes': (),
+        'distributed.worker.http.routes': (),
         # Nor with settings of malloc, which would take the memory of each frame from the system.
-        settings: dict[str, Any] = {
-            **dict.fromkeys(pages, ()),
-            'distributed.nanny.pre-spawn-environ': {},
-        }
-        stack.enter_context(dask.config.set(settings))
+        'distributed.nanny.pre-spawn-environ': {},
+    }
+    with dask.config.set(settings):
         with _ctrl_c_kept():
             cluster = distributed.LocalCluster(
                 n_workers=0,  # they start below: Ctrl-C does not wait for them
@@ -186,19 +184,18 @@ def _start_workers(n_workers: int) -> Iterator[Any]:
                 scheduler_kwargs={'dashboard': False, 'dashboard_address': '127.0.0.1:0'},
                 silence_logs=logging.CRITICAL,
             )
-            stack.enter_context(cluster)
-            client = stack.enter_context(distributed.Client(cluster, set_as_default=False))
-        try:
-            cluster.scale(n_workers)
-            yield client
-        except BaseException:
-            # Without waiting for the blocks that are computed, and for workers that start.
-            for worker in cluster.workers.values():
-                worker.close_gracefully()  # or it would start the process anew
-            for process in multiprocessing.active_children():
-                if process not in others:
+            client = distributed.Client(cluster, set_as_default=False)
+        with cluster, client:
+            try:
+                cluster.scale(n_workers)
+                yield client
+            except BaseException:
+                # Without waiting for the blocks that are computed, and for workers that start.
+                for worker in cluster.workers.values():
+                    worker.close_gracefully()  # or it would start the process anew
+                for process in {*multiprocessing.active_children()} - {*others}:
                     process.kill()
-            raise
+                raise
 
 
 @contextmanager

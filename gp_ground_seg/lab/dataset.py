@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,10 +14,10 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud, storage_of
+from gp_ground_seg.data.bags import POINT_CLOUD2, decode_cloud, encode_cloud, new_bag, storage_of
 from gp_ground_seg.data.cloud_files import encode_output
 from gp_ground_seg.data.files import changed_at, naming, read_bytes, remove_leftovers, write_file
-from gp_ground_seg.data.inputs import Input
+from gp_ground_seg.data.inputs import Inputs
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
 from gp_ground_seg.lab.cluster import Progress
 
@@ -28,16 +28,44 @@ TOPICS = {'/ground': Label.GROUND, '/obstacles': Label.OBSTACLE}
 
 
 class Item(NamedTuple):
-    """A scan or bag to segment."""
+    """Scans, or the clouds of a bag, to segment into a file each, or into one bag."""
 
-    path: Path  # of the input
-    names: Sequence[str]  # of the files to write, below the output folder
-    # Writes them into a folder, replacing others, and yields the result for each cloud.
-    write: Callable[[GroundSegmenter, Path], Iterator[Segmentation]]
-    n_clouds: int = 1
+    inputs: Inputs
+    names: Sequence[str]  # of the files or the bag to write, below the output folder
+    to_bag: bool = False
 
     def __str__(self) -> str:
-        return str(self.path)
+        return str(self.inputs.path)
+
+    def write(self, segmenter: GroundSegmenter, folder: Path) -> Iterator[Segmentation]:
+        """Write into a folder, replacing others, and yield the result for each cloud."""
+        if self.to_bag:
+            yield from write_bag(self.inputs, folder / self.names[0], segmenter)
+            return
+        for scan, name in zip(self.inputs, self.names, strict=True):
+            cloud, path = scan.read(), folder / name
+            with naming(scan.path):
+                result = segmenter.segment(cloud.xyz)
+            write_file(path, encode_output(path, cloud, result))
+            yield result
+
+
+def write_bag(source: Inputs, target: Path, segmenter: GroundSegmenter) -> Iterator[Segmentation]:
+    """Write a bag of the clouds of a bag, and yield the result for each.
+
+    It is stored as its suffix says, else as the input, and appears when the iteration ends.
+    Raises DataError if a cloud cannot be read, or the bag cannot be written.
+    """
+    storage = storage_of(source.path).replace('ros1', 'mcap')  # no ROS 1 bag is written
+    topics = dict.fromkeys(TOPICS, POINT_CLOUD2)
+    with new_bag(target, topics, force=True, storage=storage) as write:
+        for place, time, raw in source.messages():
+            with naming(place):
+                cloud = decode_cloud(raw)
+                result = segmenter.segment(read_xyz(cloud))
+            for part, label in TOPICS.items():
+                write(part, time, encode_cloud(select_points(cloud, result.label == label)))
+            yield result
 
 
 class Outcome(NamedTuple):
@@ -57,44 +85,6 @@ class Outcome(NamedTuple):
         return cls(len(label), n_ground, seconds, pose.measured, pose.contradictions)
 
 
-def write_scans(
-    scans: Iterable[Input], names: Sequence[str], segmenter: GroundSegmenter, folder: Path
-) -> Iterator[Segmentation]:
-    """Write a file for each scan, and yield the results: the `write` of an `Item`."""
-    for scan, name in zip(scans, names, strict=True):
-        cloud, path = scan.read(), folder / name
-        with naming(scan.path):
-            result = segmenter.segment(cloud.xyz)
-        write_file(path, encode_output(path, cloud, result))
-        yield result
-
-
-def write_bag(
-    source: Path, name: str, topic: str | None, segmenter: GroundSegmenter, folder: Path
-) -> Iterator[Segmentation]:
-    """Write the bag `name` of the clouds of `source`, and yield the result for each.
-
-    It is stored as its suffix says, else as the input, and appears when the iteration ends. By
-    default `topic` is the only one of PointCloud2. Raises DataError if a cloud cannot be read, or
-    the bag cannot be written.
-    """
-    target = folder / name
-    storage = storage_of(source).replace('ros1', 'mcap')  # no ROS 1 bag is written
-    with BagReader(source) as bag:
-        topic = bag.pick_point_cloud_topic(topic)
-        with BagWriter(target, force=True, storage=storage) as output:
-            for part in TOPICS:
-                output.add_topic(part)
-            for k, (_, time, raw) in enumerate(bag.messages([topic])):
-                with naming(f'{source}: message {k} of topic {topic}, recorded at {time} ns'):
-                    cloud = decode_cloud(raw)
-                    result = segmenter.segment(read_xyz(cloud))
-                for part, label in TOPICS.items():
-                    kept = select_points(cloud, result.label == label)
-                    output.write(part, time, encode_cloud(kept))
-                yield result
-
-
 def segment_block(
     folder: Path, config: Config, items: Sequence[Item], progress: Progress
 ) -> list[Outcome]:
@@ -106,7 +96,7 @@ def segment_block(
 
 def count_clouds(items: Iterable[Item]) -> int:
     """Count the clouds of items."""
-    return sum(item.n_clouds for item in items)
+    return sum(len(item.inputs) for item in items)
 
 
 def find_left(
@@ -123,7 +113,7 @@ def find_left(
     parameters : str or None
         What a run into a folder writes into `PARAMETERS`; None if the output is a single one.
     """
-    paths = [item.path.resolve() for item in items]
+    paths = [item.inputs.path.resolve() for item in items]
     inputs = {place for path in paths for place in (path, *path.parents)}
     outputs = [folder / name for item in items for name in item.names]
     for path in outputs:
@@ -156,6 +146,6 @@ def find_difference(folder: Path, parameters: str) -> str:
 
 
 def _is_finished(folder: Path, item: Item, begun: int) -> bool:
-    changed = changed_at(item.path)
+    changed = changed_at(item.inputs.path)
     written = [changed_at(folder / name) for name in item.names]
     return all(time > changed and time >= begun for time in written)

@@ -11,11 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from gp_ground_seg.core.backend import make_backend
-from gp_ground_seg.core.errors import DataError, in_thousands
-from gp_ground_seg.core.frame import OUTSIDE, FloatArray, Label
+from gp_ground_seg.core.errors import in_thousands
+from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config, find_preset
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.lab.cluster import HERE, Runner
@@ -47,6 +46,7 @@ from gp_ground_seg.lab.scoring.tables import (
 from gp_ground_seg.lab.simulation import LOW, PLACES, SCENES, SENSORS, STEEP, Kind, simulate_scan
 from gp_ground_seg.lab.simulation.objects import object_heights
 from gp_ground_seg.lab.simulation.scenes import DRIVES
+from gp_ground_seg.lab.table1 import table1
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -56,8 +56,8 @@ Changes = Mapping[str, Any]
 
 # Simulated scans.
 
-OBJECT_KINDS = {'vehicle': Kind.BOX, 'person': Kind.PERSON, 'cyclist': Kind.CYCLIST}
-"""Kinds of objects that rays hit, by `CLASSES`; crates are boxes too, but no objects."""
+OBJECT_KINDS = Kind.BOX, Kind.PERSON, Kind.CYCLIST
+"""Kinds that rays hit, in the order of `CLASSES`, where they are of an object."""
 LOWEST_OBJECT = 0.7
 """Objects of less than this height are of the nearest of `LOW_CLASSES`, of any kind [m]."""
 
@@ -92,8 +92,13 @@ def load_scan(item: Frame | SimulatedFrame) -> KnownScan:
     sensor = SENSORS[item.sensor]
     made = simulate_scan(scene, sensor, rng, x=item.x)
     truth = np.where(made.is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
-    heights = object_heights(scene.terrain, scene.solids)[made.object_id]
-    class_of = _class_of(made.kind, made.object_id, heights)
+    of_kind = np.full(len(Kind), -1)
+    of_kind[[*OBJECT_KINDS]] = range(len(OBJECT_KINDS))
+    class_of = np.where(made.object_id > 0, of_kind[made.kind], -1)
+    height = object_heights(scene.terrain, scene.solids)[made.object_id]
+    low = height < LOWEST_OBJECT
+    nearest = np.abs(height[low, None] - LOW_HEIGHTS).argmin(axis=1)
+    class_of[low] = len(CLASSES) - len(LOW_CLASSES) + nearest
     return KnownScan(
         item.sequence, f'{item.seed}/{item.x:g}', made.points, truth,
         ground_z=made.ground_z, is_ground=made.is_ground,
@@ -101,19 +106,6 @@ def load_scan(item: Frame | SimulatedFrame) -> KnownScan:
         std='ground_std', cluster=f'{item.scene} {item.seed}',
         mount=(sensor.height, sensor.origin or (0.0, 0.0, 0.0)),
     )  # fmt: skip
-
-
-def _class_of(
-    kind: npt.NDArray[np.uint8], object_id: npt.NDArray[np.int32], height: FloatArray
-) -> npt.NDArray[np.integer]:
-    """Index into `CLASSES` of what each ray hit, and how high that is, (N,); -1: no object."""
-    class_of = np.full(len(kind), -1)
-    for number, name in enumerate(OBJECT_KINDS):
-        class_of[(kind == OBJECT_KINDS[name]) & (object_id > 0)] = number
-    low = height < LOWEST_OBJECT
-    nearest = np.abs(height[low, None] - LOW_HEIGHTS).argmin(axis=1)
-    class_of[low] = len(CLASSES) - len(LOW_CLASSES) + nearest
-    return class_of
 
 
 # Variants of the method on the same scans.
@@ -151,8 +143,8 @@ STEPS = {
 CANDIDATES_PER_PSEUDO_INPUT = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
 """Candidates of a line for each pseudo-input; with the last, most lines have one."""
 
-MODES = {'every_frame': 'learning', 'fixed': 'theta fixed'}
-"""Values of ``learning.mode`` that are timed, and their titles."""
+MODES = {'learning': 'every_frame', 'theta fixed': 'fixed'}
+"""Values of ``learning.mode`` that are timed, by their titles."""
 N_PASSES = 3
 """How often each frame is timed."""
 
@@ -286,11 +278,16 @@ def measure_speed(items: Sequence[Frame], config: Config, runner: Runner = HERE)
     frame by frame, so it holds although the speed of the machine drifts. Run nothing else
     meanwhile.
     """
-    variants: dict[str, Changes] = {title: {'learning.mode': m} for m, title in MODES.items()}
+    backends = {'': config.runtime.backend}
     if make_backend(config.runtime).name != 'numpy':
-        numpy = {'runtime.backend': 'numpy'}
-        variants |= {f'{title}, numpy': {**own, **numpy} for title, own in variants.items()}
-    methods: list[Method] = [OurMethod(config.replace(**v), name) for name, v in variants.items()]
+        backends[', numpy'] = 'numpy'
+    methods: list[Method] = [
+        OurMethod(
+            config.replace(**{'learning.mode': mode, 'runtime.backend': backend}), name + end
+        )
+        for end, backend in backends.items()
+        for name, mode in MODES.items()
+    ]
     methods.insert(len(MODES), PatchworkppMethod.of_sensor(config.sensor))
     scores = score_methods([*items] * N_PASSES, methods, _points_of, runner=runner)
     points = scores.scans['points']
@@ -386,125 +383,6 @@ def _rough_table(scores: Scores) -> Table:
     )
     title += peer_note(scores, ', which gets the true height')
     return Table(title, table.reset_index())
-
-
-# The paper's Table I.
-
-COMPARED = {'Z-L': 'latent', 'Z': 'line_gradient'}
-"""The paper's method and the one it is compared with, as values of ``length_scale.model``."""
-CHOICES = {('10', '000000'): (157, 158), ('03', '000006'): (147, 148)}
-"""Segments by sequence and frame: an adjacent pair that climbs a verge and a hill, 3 m over 30 m,
-and one on uneven ground."""
-N_REPEATS = 9
-VARIANCES = ('sigma_f^2', 'sigma_n^2', 'sigma_f_bar^2', 'sigma_l_bar^2', 'sigma_n_bar^2')
-"""Squares of the first entries of theta: in m^2; those of f_bar and n_bar without unit."""
-SMSE, HELD_OUT, TIMES = (
-    [f'{what}{name}{unit}' for name in COMPARED]
-    for what, unit in (('in sample ', ''), ('held out ', ''), ('t ', ' [s]'))
-)
-PRINTED = {
-    'a': (36, 23, 0.3663, 0.8607, 1.415e6, 2.250e6, 1.187e6,
-          2.4258e-27, 1.4978e-23, 0.5432, 0.2335),
-    'b': (52, 30, 0.3117, 0.7207, 4.729e6, 1.347e6, 2.058e6,
-          1.2466e-28, 1.1231e-23, 1.0045, 0.4356),
-    'c': (68, 16, 0.4896, 1.1544, 1.381e6, 3.881e6, 4.501e6,
-          2.7561e-26, 1.4102e-21, 0.3283, 0.1963),
-    'd': (81, 14, 0.1103, 1.6487, 4.588e6, 3.521e6, 4.402e6,
-          4.2903e-19, 8.6733e-22, 0.2732, 0.3412),
-}  # fmt: skip
-"""n_PG, n_L, `VARIANCES`, `SMSE`, `TIMES` in the paper, of segments a to d of its Figure 1; it
-names no frames."""
-
-
-def table1(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Report:
-    """Measure the paper's Table I on segments of labelled frames, beside its printed values.
-
-    P. Mehrabi and H. D. Taghirad, "A Novel Gaussian Process Based Ground Segmentation Algorithm
-    with Local-Smoothness Estimation", arXiv 2112.05847. With the parameters given (ours), and
-    with the preset ``paper``. Each method runs on each frame once without counting, then nine
-    times, alternately.
-    """
-    frames = {(frame.sequence, frame.index): frame for frame in items}
-    for sequence, index in CHOICES.keys() - frames.keys():
-        raise DataError(f'no frame {index} in sequence {sequence}')
-    rows: list[dict[str, Any]] = []
-    for by, own in {'ours': config, 'preset': find_preset('paper').config}.items():
-        methods = [
-            OurMethod(own.replace(**{**ALL_LEARNED, 'length_scale.model': model}), name)
-            for name, model in COMPARED.items()
-        ]
-        for choice, segments in CHOICES.items():
-            rows += ({'by': by, **row} for row in _rows(frames[choice], segments, methods, runner))
-    columns = ['n_PG', 'n_L', *VARIANCES, *SMSE, *TIMES]
-    printed = (
-        {'segment': name, 'by': 'paper', **dict(zip(columns, values, strict=True))}
-        for name, values in PRINTED.items()
-    )
-    every = frame_of([*rows, *printed])
-    variances = (
-        'Variances learned over the frame by Z-L [m^2; of f_bar and n_bar without unit]; preset: '
-        'the preset paper; paper: as printed, of its segments a to d'
-    )
-    errors = (
-        'SMSE in sample (at the inliers) and held out (n points of labelled ground); seconds per '
-        f'frame: median of {N_REPEATS} runs on the whole frame, reading left out'
-    )
-    forms = {name: Form(name, '#.4g') for name in (*VARIANCES, *SMSE, *HELD_OUT)}
-    forms |= {name: Form(name, '.4f') for name in TIMES}
-    forms |= {name: Form(name.split()[-1], *COUNT) for name in (*columns[:2], 'held out n')}
-    shown = every[['segment', 'by', *SMSE, 'held out n', *HELD_OUT, *TIMES]]
-    tables = {
-        'variances': Table(variances, every[['segment', 'by', *columns[:7]]], forms),
-        'errors': Table(errors, shown, forms),
-    }
-    return Report(tables, rows, methods[0].last.fit.backend, config)
-
-
-def _rows(
-    frame: Frame, segments: Sequence[int], methods: Sequence[OurMethod], runner: Runner
-) -> list[dict[str, Any]]:
-    """Rows of a frame, by title of the column."""
-    scan = load_kitti(frame)
-    scores = score_methods([scan] * N_REPEATS, methods, lambda scan: scan, runner=runner)
-    seconds = scores.scans.groupby('method')['seconds'].median()
-    # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
-    common = methods[0].last
-    candidates, grid = common.candidates, common.grid
-    # In double precision, which those of the labels are not in.
-    x, y, z = common.pose.level(scan.points[:, :3]).T.astype(np.float64)
-    # A candidate is the point at the same place.
-    modelled = scan.is_ground & (grid.bin != OUTSIDE)
-    modelled &= ~np.isin(x + 1j * y, candidates.x + 1j * candidates.y)
-    rows = []
-    for segment in segments:
-        part = slice(*candidates.offsets[segment : segment + 2])
-        held_out = np.flatnonzero(modelled & (grid.segment == segment))
-        row: dict[str, Any] = {
-            'segment': f'{frame.sequence}/{frame.index}:{segment}',
-            'n_PG': int(part.stop - part.start),
-            'n_L': int(np.diff(common.pseudo.offsets)[segment]),
-            **dict(zip(VARIANCES, np.exp(2.0 * common.theta).tolist(), strict=False)),
-            'held out n': len(held_out),
-        }
-        for k, method in enumerate(methods):
-            # Of the process itself, as in the paper; not the corrected surface.
-            result, surface = method.last, method.last.surface
-            at = np.flatnonzero(surface.inlier[part]) + part.start
-            known = surface.knots, surface.mean[segment]
-            row[SMSE[k]] = _smse(candidates.z[at], np.interp(candidates.r[at], *known))
-            relief = result.relief.at(x[held_out], y[held_out])
-            ground = np.add(np.interp(grid.r[held_out], *known), relief)
-            row[HELD_OUT[k]] = _smse(z[held_out], ground)
-            row[TIMES[k]] = seconds[method.name]
-        rows.append(row)
-    return rows
-
-
-def _smse(truth: FloatArray, estimate: FloatArray) -> float:
-    """Standardised mean squared error of heights, (n,) [m], where there is a model."""
-    known = np.isfinite(estimate)
-    truth, estimate = truth[known], estimate[known]
-    return float(np.mean((estimate - truth) ** 2) / np.var(truth))
 
 
 THREE = ('hdl-64e', 'vlp-16', 'os1-128')

@@ -169,8 +169,7 @@ def label_layers(label: Labels, truth: Labels | None = None) -> tuple[str, Layer
     return f'{n_false} false ground, {n_missed} missed ground{score}', layers
 
 
-CANDIDATE_COLOUR = '#56636E'
-LINE_COLOUR, SURFACE_COLOUR, PSEUDO_INPUT_COLOUR = GREEN, '#111111', VIOLET
+CANDIDATE_COLOUR, LINE_COLOUR, SURFACE_COLOUR = '#56636E', GREEN, '#111111'
 
 # Metres kept free below and above the ground, and beyond the last candidate.
 BELOW, ABOVE, BEYOND = 0.4, 0.9, 2.0
@@ -198,15 +197,13 @@ def plot_segment(
     shared = {'sharex': True, 'sharey': 'row', 'squeeze': False}
     panels = figure.subplots(2, len(views), height_ratios=(2.6, 1.0), **shared)
     for view, (above, below) in zip(views, panels.T, strict=True):
-        name = f'{title}, {view.name}' if title else view.name
+        name = f'{title}, {view.name}' if title and view is views[0] else view.name
         above.set_title(name, fontsize=12, loc='left', parse_math=False)
         view.draw_points(above, truth)
         view.draw_ground(above)
         view.draw_length_scale(below)
-        title = ''
-    reach = max(view.reach() for view in views)
     lows, highs = zip(*(view.heights_shown() for view in views), strict=True)
-    panels[0, 0].set_xlim(0.0, reach)
+    panels[0, 0].set_xlim(0.0, max(view.reach for view in views))
     panels[0, 0].set_ylim(min(lows), max(highs))
     for axes in panels.flat:
         axes.grid(color='#E9ECEE', linewidth=0.7)
@@ -226,31 +223,20 @@ class SegmentView:
     """
 
     def __init__(self, result: Segmentation, segment: int, z: FloatArray) -> None:
-        self._result, self._segment, self._own = result, segment, result.segment(segment)
-        self._inside = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
-        self.r, self.z = result.grid.r[self._inside], z[self._inside]
-
-    @property
-    def name(self) -> str:
-        """Number of the segment and its azimuths, and whether it has a ground model."""
-        width = 360.0 / self._result.grid.n_segments
-        first, last = (width * (self._segment + k) - 180.0 for k in (0, 1))
-        model = '' if len(self._own.knots) else ': no ground model'
-        return f'segment {self._segment}, azimuth {first:g}° to {last:g}°{model}'
-
-    @property
-    def counts(self) -> str:
-        """Numbers of candidates, inliers and pseudo-inputs."""
-        own = self._own
-        return (
-            f'segment {self._segment}: {len(own.r)} candidates, {own.inlier.sum()} inliers, '
+        own, grid = result.segment(segment), result.grid
+        self._result, self._segment, self._own = result, segment, own
+        self._inside = (grid.segment == segment) & (grid.bin != OUTSIDE)
+        self.r, self.z = grid.r[self._inside], z[self._inside]
+        first, last = (360.0 / grid.n_segments * (segment + k) - 180.0 for k in (0, 1))
+        model = '' if len(own.knots) else ': no ground model'
+        self.name = f'segment {segment}, azimuth {first:g}° to {last:g}°{model}'
+        self.counts = (
+            f'segment {segment}: {len(own.r)} candidates, {own.inlier.sum()} inliers, '
             f'{len(own.pseudo_r)} pseudo-inputs'
         )
-
-    def reach(self) -> float:
-        """Return the range that holds all candidates, or if none all points [m]."""
-        r = self._own.r if len(self._own.r) else self.r
-        return float(r.max()) + BEYOND if len(r) else float(self._result.grid.edges[-1])
+        # What holds all candidates, or if none all points [m].
+        r = own.r if len(own.r) else self.r
+        self.reach = float(r.max()) + BEYOND if len(r) else float(grid.edges[-1])
 
     def draw_points(self, axes: Any, truth: Labels | None) -> None:
         """Draw points over range by label, and errors on them, if the true labels are known."""
@@ -288,17 +274,16 @@ class SegmentView:
         candidates, lines = self._result.candidates, self._result.lines
         first, last = candidates.offsets[self._segment : self._segment + 2]
         numbers = np.unique(lines.line[first:last])
-        look = {'color': LINE_COLOUR, 'lw': 3.2, 'alpha': 0.75, 'zorder': 4, 'label': 'lines'}
-        for q in numbers:
+        label: str | None = 'lines'
+        for q in numbers[np.diff(lines.start)[numbers] > 1]:
             points = slice(lines.start[q], lines.start[q + 1])
-            if points.stop - points.start > 1:
-                own_r, own_z = candidates.r[points], candidates.z[points]
-                r = np.linspace(own_r[0], own_r[-1], N_OF_LINE)
-                slope = np.clip(lines.slope[q], -STEEPEST, STEEPEST)
-                z = np.clip(own_z.mean() + slope * (r - own_r.mean()), own_z.min(), own_z.max())
-                relief = self._result.relief.at_knots(r, self._result.grid.n_segments)
-                axes.plot(r, z + relief[self._segment], **look)
-                look['label'] = None  # one entry in the legend for all
+            own_r, own_z = candidates.r[points], candidates.z[points]
+            r = np.linspace(own_r[0], own_r[-1], N_OF_LINE)
+            slope = np.clip(lines.slope[q], -STEEPEST, STEEPEST)
+            z = np.clip(own_z.mean() + slope * (r - own_r.mean()), own_z.min(), own_z.max())
+            z += self._result.relief.at_knots(r, self._result.grid.n_segments)[self._segment]
+            axes.plot(r, z, color=LINE_COLOUR, lw=3.2, alpha=0.75, zorder=4, label=label)
+            label = None  # one entry in the legend for all
         critical = lines.start[numbers[1:]] - first
         axes.plot(
             self._own.r[critical], self._own.z[critical], 'd', ms=9, mfc='none', mec=LINE_COLOUR,
@@ -312,7 +297,7 @@ class SegmentView:
         own, limits = self._own, self._result.config.length_scale
         axes.plot(own.knots, own.length_scale, color=SURFACE_COLOUR, lw=1.8, label='length-scale')
         if limits.model == 'latent':
-            look = {'ms': 5, 'color': PSEUDO_INPUT_COLOUR, 'mew': 0.0, 'label': 'pseudo-inputs'}
+            look = {'ms': 5, 'color': VIOLET, 'mew': 0.0, 'label': 'pseudo-inputs'}
             axes.plot(own.pseudo_r, own.pseudo_l, 's', **look)
         for limit in (limits.min, limits.max):
             axes.axhline(limit, color=SURFACE_COLOUR, lw=0.8, ls=':')

@@ -164,15 +164,12 @@ def box(content: str) -> str:
 
 def legend(names: Iterable[str]) -> str:
     """Return what the colours of points mean, as HTML."""
-    samples = {
-        name: ' '.join(
-            f'<nobr><span style="background:{colour}">&emsp;</span> {word}</nobr>'
-            for word, colour in LEGENDS[name].items()
-            if word != 'unknown'
-        )
-        for name in names
-    }
-    return '<br>'.join(f'{name}: {words}' for name, words in samples.items())
+    sample = '<nobr><span style="background:{}">&emsp;</span> {}</nobr>'
+    lines = []
+    for name in names:
+        colours = {word: c for word, c in LEGENDS[name].items() if word != 'unknown'}
+        lines.append(f'{name}: {" ".join(sample.format(c, w) for w, c in colours.items())}')
+    return '<br>'.join(lines)
 
 
 _USUAL = {'sensor.height': (0.2, 4.0), 'sensor.roll': (-0.3, 0.3), 'sensor.pitch': (-0.3, 0.3)}

@@ -1,15 +1,12 @@
 """`segment` and `plot` on clouds of every format: files, folders, data sets, bags."""
 
 import re
-import struct
-import sys
 
 import numpy as np
 import pytest
 from bag_samples import scan, write_ros2_bag
-from cli_runner import error_line, run
+from cli_runner import run
 from conftest import REPOSITORY
-from foreign_files import pcd
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.errors import DataError
@@ -132,18 +129,8 @@ def test_clouds_and_pictures_of_a_bag(tmp_path, capsys):
             np.testing.assert_array_equal(found['i'], scan(k)[:, 3])
             assert found['ring'].dtype == np.uint16 and len(found['label']) == len(scan(k))
     pytest.importorskip('matplotlib')
-    for frame, code in enumerate((0, 0, 0, 2)):
-        capsys.readouterr()
-        assert run('plot', 'scan', bag, '--frame', frame, '-o', tmp_path / f'{frame}.png') == code
-    assert '--frame 3: must be 0 to 2 here' in error_line(capsys)
+    for frame in range(3):
+        assert run('plot', 'scan', bag, '--frame', frame, '-o', tmp_path / f'{frame}.png') == 0
     assert run('plot', 'segment', bag, '--segment', 9, '-o', tmp_path / 'a.png') == 0
     assert 'note: the first of 3 clouds, drive.mcap[0] ...: see --frame' in capsys.readouterr().err
     assert len({(tmp_path / f'{frame}.png').read_bytes() for frame in range(3)}) == 3
-
-
-def test_a_missing_package_is_named(tmp_path, monkeypatch, capsys):
-    body = struct.pack('<II', 9, 4 * 12)
-    (tmp_path / 'a.pcd').write_bytes(pcd(data='binary_compressed', body=body + bytes(9)))
-    monkeypatch.setitem(sys.modules, 'lzf', None)
-    assert run('segment', tmp_path / 'a.pcd', '-o', tmp_path / 'out.npy') == 2
-    assert re.match('lzf is not installed.*pip install python-neo-lzf$', error_line(capsys))

@@ -5,6 +5,8 @@ import io
 import logging
 import re
 import shlex
+import struct
+import sys
 import time
 from pathlib import Path
 
@@ -13,9 +15,13 @@ import pytest
 from bag_samples import scan, write_ros2_bag
 from cli_runner import error_line
 from conftest import run_python
+from evaluation_samples import write_streets
+from foreign_files import pcd
 
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.cli import options
+from gp_ground_seg.data import semantic_kitti
+from gp_ground_seg.lab import cluster
 
 HEAVY = {'numba', 'scipy', 'matplotlib', 'pandas', 'rosbags', 'rclpy'}
 
@@ -36,6 +42,7 @@ FILES = {
     'scan.txt': b'1 2 3', 'notes.md': b'mine', 'none/a.las': b'', 'taken.pcd': b'mine',
     'old.png': b'mine', 'mine/000000.label': b'mine', 'a.label': b'',
     'typo.yaml': b'label: {ground_tolerence: 0.1}',
+    'packed.pcd': pcd(data='binary_compressed', body=struct.pack('<II', 9, 48) + bytes(9)),
 }  # fmt: skip
 MISTAKES = {
     'segmnt A': "COMMAND: invalid choice: 'segmnt' .choose from .*; see gp-",
@@ -81,6 +88,7 @@ MISTAKES = {
     'plot scan scan.npy -o a.gif': 'a.gif: must end in .png or .pdf or .svg',
     'plot scan scan.npy -o old.png': 'old.png: exists already; --force replaces it',
     'plot scan many -o a.png --frame 2': '--frame 2: must be 0 to 1 here',
+    'plot scan drive.mcap -o a.png --frame 3': '--frame 3: must be 0 to 2 here',
     'plot scan scan.npy -o a.png --labels a.label': 'a.label: 0 bytes, expected 7200 for 1800 poi',
     'plot scan scan.npy -o a.png --labels /no.label': '/no.label: ',
     **{
@@ -93,7 +101,48 @@ MISTAKES = {
     'plot segment scan.npy -o B.png --segment 180': r'segment 180: must be in \[0, 179\]',
     'plot segment scan.npy -o B.png --segment -1': 'segment -1',
     'evaluate many': 'many: no sequences/.*velodyne folder .*; scans without labels need --agai',
+    'evaluate kitti --sequences ,': '.*no sequence has labels, of 00, 08',
+    'evaluate kitti --json /no/such/folder/x.json': '/no/such/folder',
+    'evaluate kitti --cut=-0.1': "--cut: '-0.1': must be a number, at least 0",
+    'evaluate kitti --set sensor.height=0 --peer patchworkpp': '.*set sensor.origin_z above 0',
+    'evaluate kitti --against default': '--against default: the same parameters as given',
+    'evaluate kitti --against no.yaml': 'no.yaml: No such file',
+    'evaluate kitti --against paper --peer patchworkpp': '--peer: not allowed with',
+    **{
+        f'evaluate scan.npy --against paper {option} 2': f'{option}: '
+        for option in ('--sequences', '--frame-step', '--cut', '--workers')
+    },
+    'experiment': 'the following arguments are required: NAME',
+    'experiment moon': "NAME: invalid choice: 'moon'",
+    'experiment ablation kitti --seeds 2': '--seeds: is for simulated scans',
+    'experiment ablation --frame-step 2': '--frame-step: is for labelled scans',
+    'experiment ablation kitti --sequences 07': '.* in it; sequences here: 00, 08',
+    'experiment ablation --set length_scale.model=latent2': '.*length_scale.model',
     'experiment scenes --scenes flt': "--scenes: 'flt': must be some of .*, each once",
+    'experiment scenes --scenes flat,flat': '--scenes: .*each once',
+    'experiment scenes --json notes.md': 'notes.md: exists already; --force',
+    'experiment table1': 'the following arguments are required: ROOT',
+    'experiment table1 kitti --sequences 08': 'no frame 00000[06] in sequence ',
+    # Workers of whole data sets.
+    'segment kitti -o out --workers 99999999999': '--workers 9+: .*four for each processor',
+    **{
+        f'segment kitti -o out --scheduler {address}': f'--scheduler {address}: does not answer'
+        for address in ('tcp://127.0.0.1:1', 'tls://127.0.0.1:1', 'somewhere')
+    },
+    # The name before it is that of a package that is missing.
+    **{
+        f'{package}! {words}': f'{package} is not installed'
+        for package, words in (
+            ('distributed', 'segment kitti -o out --workers 1'),
+            ('cryptography', 'segment kitti -o out --workers 1'),
+            ('distributed', 'segment kitti -o out --scheduler tcp://127.0.0.1:1'),
+            ('pandas', 'evaluate kitti'),
+            ('pandas', 'experiment steps kitti'),
+            ('tabulate', 'evaluate kitti --markdown'),
+            ('pypatchworkpp', 'evaluate kitti --peer patchworkpp'),
+        )
+    },
+    'lzf! segment packed.pcd -o out.npy': 'lzf is not installed.*pip install python-neo-lzf$',
     'play nowhere.mcap': 'nowhere.mcap: no such file or folder',
     'play scan.npy': r'scan.npy: not a bag; accepted are ROS 1 \.bag, \.mcap, \.db3 and rosbag2',
     'play A --rate 0': "--rate: '0': must be a number, above 0",
@@ -113,6 +162,7 @@ def inputs(tmp_path_factory):
         write = Path.write_bytes if isinstance(content, bytes) else np.save
         write(folder / name, content)
     write_ros2_bag(folder / 'drive.mcap')
+    write_streets(folder / 'kitti', s00=3, s08=1)
     return folder
 
 
@@ -124,8 +174,12 @@ def test_mistakes_are_one_line_with_the_next_step_and_change_nothing(
         return {path: path.is_file() and path.read_bytes() for path in inputs.rglob('*')}
 
     monkeypatch.chdir(inputs)
-    before = content()
-    assert cli.main(line.split()) == 2
+    monkeypatch.setattr(semantic_kitti, 'read_points', None)  # they stop before any frame is read
+    monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT', 0.5)
+    before, (missing, _, words) = content(), line.rpartition('! ')
+    if missing:
+        monkeypatch.setitem(sys.modules, missing, None)
+    assert cli.main(words.split()) == 2
     assert re.match(MISTAKES[line], said := error_line(capsys)), said
     assert content() == before
 

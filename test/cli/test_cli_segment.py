@@ -18,7 +18,7 @@ from gp_ground_seg.cli.segment import _pose_summary
 from gp_ground_seg.core.errors import in_thousands
 from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
-from gp_ground_seg.data.bags import BagReader, BagWriter, decode_cloud, encode_cloud, storage_of
+from gp_ground_seg.data.bags import BagReader, decode_cloud, encode_cloud, storage_of
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 
@@ -123,10 +123,7 @@ def test_bag_gets_ground_and_obstacles(
 def test_empty_and_all_nan_clouds_give_empty_clouds(tmp_path):
     nothing = select_points(samples.cloud(0), np.zeros(1801, dtype=bool))
     nan = select_points(samples.cloud(0), np.arange(1801) == 1800)
-    with BagWriter(tmp_path / 'in.mcap') as bag:
-        bag.add_topic('/points')
-        for k, cloud in enumerate((nothing, nan)):
-            bag.write('/points', k, encode_cloud(cloud))
+    samples.write_clouds(tmp_path / 'in.mcap', map(encode_cloud, (nothing, nan)))
     assert segment(tmp_path / 'in.mcap', '--format', 'npz', '-o', tmp_path / 'arrays') == 0
     assert segment(tmp_path / 'in.mcap') == 0
     messages = read_messages(tmp_path / 'in_ground.mcap')
@@ -137,11 +134,9 @@ def test_empty_and_all_nan_clouds_give_empty_clouds(tmp_path):
 def test_bad_cloud_stops_the_run_and_is_named(tmp_path, capsys):
     out = tmp_path / 'out'
     before = samples.write_ros2_bag(out)
-    with BagWriter(tmp_path / 'in.mcap') as bag:
-        bag.add_topic('/points')
-        for k in range(4):
-            raw = encode_cloud(samples.cloud(k))
-            bag.write('/points', 1000 + k, raw[:5000] if k == 2 else raw)
+    raws = [encode_cloud(samples.cloud(k)) for k in range(4)]
+    raws[2] = raws[2][:5000]
+    samples.write_clouds(tmp_path / 'in.mcap', raws, 1000)
     assert segment(tmp_path / 'in.mcap', '-o', out, '--force') == 2
     place = 'in.mcap: message 2 of topic /points, recorded at 1002 ns: '
     assert f'{place}5000 bytes that are no sensor_msgs/msg/PointCloud2' in error_line(capsys)

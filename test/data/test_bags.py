@@ -10,11 +10,11 @@ from gp_ground_seg.core.errors import DataError, MissingDependencyError
 from gp_ground_seg.data.bags import (
     POINT_CLOUD2,
     BagReader,
-    BagWriter,
     decode_cloud,
     encode_cloud,
     is_bag_folder,
     jazzy_types,
+    new_bag,
 )
 from gp_ground_seg.data.inputs import holds_bag
 
@@ -24,6 +24,10 @@ NAMES = 'drive', 'drive.mcap', 'drive.db3'
 def read_all(path):
     with BagReader(path) as bag:
         return list(bag.messages())
+
+
+def new_bag_at(path):
+    new_bag(path, {}).__enter__()
 
 
 def listing(folder):
@@ -105,16 +109,17 @@ def test_errors_of_the_caller_pass_unchanged(tmp_path):
 @pytest.mark.parametrize('name', ['home', 'file', 'folder.mcap'])
 def test_what_is_no_bag_is_never_replaced(tmp_path, name):
     """Also where it appears while the bag is written."""
-    with BagWriter(tmp_path / name, force=True) as bag:
-        for folder in ('home', 'folder.mcap'):
-            (tmp_path / folder).mkdir()
-        for file in ('home/thesis.tex', 'home/metadata.yaml', 'file'):
-            (tmp_path / file).write_text('years of work')
-        files = {*tmp_path.rglob('[!.]*')} - {*tmp_path.glob('.*/**/*')}
-        with pytest.raises(DataError, match='not replaced'):
-            bag.__exit__(None, None, None)
+    bag = new_bag(tmp_path / name, {}, force=True)
+    bag.__enter__()
+    for folder in ('home', 'folder.mcap'):
+        (tmp_path / folder).mkdir()
+    for file in ('home/thesis.tex', 'home/metadata.yaml', 'file'):
+        (tmp_path / file).write_text('years of work')
+    files = {*tmp_path.rglob('[!.]*')} - {*tmp_path.glob('.*/**/*')}
     with pytest.raises(DataError, match='not replaced'):
-        BagWriter(tmp_path / name, force=True).__enter__()
+        bag.__exit__(None, None, None)
+    with pytest.raises(DataError, match='not replaced'):
+        new_bag(tmp_path / name, {}, force=True).__enter__()
     assert {*tmp_path.rglob('*')} == files
     assert (tmp_path / 'file').read_text() == 'years of work'
 
@@ -123,7 +128,7 @@ def test_impossible_paths_are_refused(tmp_path):
     samples.write_ros2_bag(tmp_path / 'a.db3')
     (tmp_path / 'a.db3').rename(tmp_path / 'a#2?.db3')
     for make, name, message in (
-        (BagWriter, '100%.db3', 'sqlite3 bag cannot have % in its path'),
+        (new_bag_at, '100%.db3', 'sqlite3 bag cannot have % in its path'),
         (BagReader, 'a#2?.db3', r'sqlite3 bag cannot have # \? in its path'),
     ):
         with pytest.raises(DataError, match=message):
@@ -131,7 +136,7 @@ def test_impossible_paths_are_refused(tmp_path):
     assert listing(tmp_path) == ['a#2?.db3']
 
 
-@pytest.mark.parametrize('call', [BagReader, BagWriter, decode_cloud])
+@pytest.mark.parametrize('call', [BagReader, new_bag_at, decode_cloud])
 def test_without_rosbags_the_error_says_what_to_install(monkeypatch, call):
     jazzy_types.cache_clear()
     monkeypatch.setitem(sys.modules, 'rosbags', None)

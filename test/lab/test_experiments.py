@@ -10,7 +10,7 @@ from evaluation_samples import scores_of, write_frame, write_streets
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.parameters.config import PRESETS
 from gp_ground_seg.data.semantic_kitti import labelled_frames
-from gp_ground_seg.lab import experiments
+from gp_ground_seg.lab import experiments, table1
 from gp_ground_seg.lab.experiments import MODELS, SimulatedFrame, load_scan, simulated_frames
 from gp_ground_seg.lab.scoring.evaluate import (
     OURS,
@@ -216,9 +216,9 @@ def test_columns_of_table_1_follow_their_definitions(tmp_path, monkeypatch):
     made = simulated('road_then_rubble', 'hdl-32e', seed=1)
     semantic = semantic_kitti_labels(made.kind)
     write_frame(tmp_path, '00', 0, made.points, semantic)
-    monkeypatch.setattr(experiments, 'CHOICES', {('00', '000000'): SEGMENTS})
-    monkeypatch.setattr(experiments, 'N_REPEATS', 1)
-    rows = experiments.table1(labelled_frames(tmp_path), Config()).rows
+    monkeypatch.setattr(table1, 'CHOICES', {('00', '000000'): SEGMENTS})
+    monkeypatch.setattr(table1, 'N_REPEATS', 1)
+    rows = table1.table1(labelled_frames(tmp_path), Config()).rows
     assert [row['by'] for row in rows] == ['ours', 'ours', 'preset', 'preset']
     x, y, z, _ = made.points.T.astype(float)
     r, azimuth = np.hypot(x, y), np.degrees(np.arctan2(y, x))
@@ -237,7 +237,7 @@ def test_columns_of_table_1_follow_their_definitions(tmp_path, monkeypatch):
             assert row['n_PG'] == own.stop - own.start
             assert row['n_L'] == np.diff(result.pseudo.offsets)[segment]
             if method == 'Z-L':
-                found = [row[title] for title in experiments.VARIANCES]
+                found = [row[title] for title in table1.VARIANCES]
                 np.testing.assert_allclose(found, np.square(sigma), rtol=1e-12)
             inlier = result.surface.inlier[own]
             expected = smse(candidates.z[own][inlier], candidates.r[own][inlier])

@@ -15,7 +15,7 @@ from evaluation_samples import write_streets
 from gp_ground_seg import __version__
 from gp_ground_seg.cli.main import COMMANDS, build_parser
 from gp_ground_seg.core.jit import JIT_ENABLED
-from gp_ground_seg.lab import experiments
+from gp_ground_seg.lab import table1
 
 figures = load_script('docs/figures.py')
 
@@ -150,7 +150,7 @@ def root_for(figure):
 @compiled
 @pytest.mark.parametrize('figure', SAMPLED, ids=lambda figure: f'{figure.page}: {figure.command}')
 def test_samples_of_tables_come_out_again(figure, capfd, monkeypatch):
-    monkeypatch.setattr(experiments, 'N_REPEATS', 1)  # of what is timed
+    monkeypatch.setattr(table1, 'N_REPEATS', 1)  # of what is timed
     assert run(*figures.words_of(figure.sample, root_for(figure))) == 0
     found = figures.rows_of(figures.kept(figure, capfd.readouterr().out.strip()))
     wrong = list(differences(figures.read_samples()[figure.sample], found))

@@ -9,7 +9,7 @@ import ros_helpers as ros
 from nav_msgs.msg import OccupancyGrid
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros_helpers import street, to_message, xyz_of
-from sensor_msgs.msg import LaserScan, PointField
+from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.parameters.schema import NODE_NAME
@@ -23,7 +23,10 @@ from gp_ground_seg.ros.outputs import MODEL_FIELDS, read_ground_model
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
-OPTIONAL = {o.topic: o.message_type for o in outputs.OUTPUTS if o.is_optional}
+OPTIONAL = {
+    '~/labeled': PointCloud2, '~/ground_model': PointCloud2, '~/scan': LaserScan,
+    '~/occupancy': OccupancyGrid,
+}  # fmt: skip
 CONFIG = Config().replace(**{'learning.mode': 'fixed'})
 
 
@@ -31,6 +34,10 @@ CONFIG = Config().replace(**{'learning.mode': 'fixed'})
 def b():
     with ros.bench({'learning.mode': 'fixed'}) as shared:
         yield shared
+
+
+def test_the_optional_outputs_have_their_types():
+    assert {o.topic: o.message_type for o in outputs.OUTPUTS if o.is_optional} == OPTIONAL
 
 
 def received(b, topic, message):

@@ -429,27 +429,21 @@ def _low_scene(name: str, seed: int) -> Scene:
         bearing += 2.0 * half + LOW_GAP
 
 
-DRIVES: dict[str, Callable[[int], Scene]] = {
+Build = Callable[[int], Scene]
+"""Makes a scene of a seed."""
+DRIVES: dict[str, Build] = {
     **{name: functools.partial(_open_scene, name) for name in _OPEN_COUNTRY},
     'urban': _urban,
 }
-"""Scenes whose lane along x is free, by name: seed -> scene."""
-LOW: dict[str, Callable[[int], Scene]] = {
-    name: functools.partial(_low_scene, name) for name in _LOW_OBJECTS
-}
+"""Scenes whose lane along x is free, by name."""
+LOW: dict[str, Build] = {name: functools.partial(_low_scene, name) for name in _LOW_OBJECTS}
 """Scenes of low objects."""
 STEEP = {'hills': _hills, 'valley': _valley, 'bank': _bank, 'on_ramp': _on_ramp, 'dike': _dike}
 """Scenes of steep ground."""
 PLACES = {
-    'traffic_jam': _traffic_jam,
-    'car_park': _car_park,
-    'hidden_climb': _hidden_climb,
-    'wet_road': _wet_road,
-    'blind_slope': _blind_slope,
-    'hedge': _hedge,
-    **LOW,
-    **STEEP,
-}
+    'traffic_jam': _traffic_jam, 'car_park': _car_park, 'hidden_climb': _hidden_climb,
+    'wet_road': _wet_road, 'blind_slope': _blind_slope, 'hedge': _hedge, **LOW, **STEEP,
+}  # fmt: skip
 """All scenes around a sensor at the origin."""
 SCENES = {**DRIVES, **PLACES}
 """All scenes by name."""
