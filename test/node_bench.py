@@ -3,12 +3,15 @@
 The node runs in a second process and is sent clouds through ROS at several rates, in a namespace
 of a random name. DATA is a folder with sequences/*/velodyne below it, a scan, a
 folder of scans, or a bag; without it, simulated scans of a sensor. What follows ``--ros-args``
-goes to the node.
+goes to the node. With --first-minute, rows are of 60 s at 10 Hz from where a node without compiled
+code begins to listen, on all cores and on one, or beside a busy loop on each of them.
 """
 
 import argparse
+import contextlib
 import itertools
 import os
+import subprocess
 import sys
 import tempfile
 import time
@@ -22,6 +25,7 @@ from gp_ground_seg.cli.demo import FRAME_ID
 from gp_ground_seg.cli.options import progress
 from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_stamp
 from gp_ground_seg.data.inputs import list_inputs
+from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab.scoring.report import describe_environment, machine_line
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 from gp_ground_seg.ros.node_process import INPUT, OUTPUTS, Link, NodeProcess, private_session
@@ -113,16 +117,24 @@ def cpu_of(pid):
     return sum(map(int, fields[11:15])) / os.sysconf('SC_CLK_TCK')
 
 
-def measure(clouds, rates, n_frames, ros_args=()):
-    """Results at each rate, with what the node says it dropped, and its CPU time of a cloud."""
-    from diagnostic_msgs.msg import DiagnosticArray
-
-    stamped = restamped(clouds, 1_700_000_000)
+@contextlib.contextmanager
+def started(ros_args):
+    """A session, and the node of a second process that it talks to."""
     with (
         private_session('node_bench') as (session, own),
         tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
         NodeProcess(Path(folder, 'log'), [*own, *ros_args]) as node,
     ):
+        yield session, node
+        node.check()
+
+
+def measure(clouds, rates, n_frames, ros_args=()):
+    """Results at each rate, with what the node says it dropped, and its CPU time of a cloud."""
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    stamped = restamped(clouds, 1_700_000_000)
+    with started(ros_args) as (session, node):
         arrays, results = [], []
         session.node.create_subscription(DiagnosticArray, '/diagnostics', arrays.append, 10)
         Link(session, node).connect(clouds[0])
@@ -137,16 +149,51 @@ def measure(clouds, rates, n_frames, ros_args=()):
             found['CPU [ms]'] = f'{1e3 * (cpu_of(node.pid) - cpu) / n_frames:.1f}'
             n_dropped = dropped_by_node(session, arrays) - before
             results.append({**found, 'reported': n_dropped})
-        node.check()
     return results
+
+
+def first_minute(clouds, cores, is_busy, ros_args=()):
+    """Results of the first minute of a node on some `cores`, with nothing compiled before."""
+    before, beside, compiled = os.sched_getaffinity(0), [], []
+    with tempfile.TemporaryDirectory() as cache, contextlib.ExitStack() as stack:
+        os.environ['NUMBA_CACHE_DIR'] = cache
+        os.sched_setaffinity(0, cores)  # also of what is started here
+        session, node = stack.enter_context(started(ros_args))
+        for core in cores if is_busy else ():
+            os.sched_setaffinity(0, {core})
+            beside.append(subprocess.Popen([sys.executable, '-c', 'while True: pass']))
+        os.sched_setaffinity(0, before)
+        try:
+            probe = Probe(session)
+            session.wait_for(lambda: any('listening' in x for x in node.log_lines()), 60.0)
+            start = time.monotonic()
+
+            def note():
+                if not compiled and node.is_compiled():
+                    compiled.append(time.monotonic() - start)
+
+            found = probe.send(itertools.islice(restamped(clouds, 1), 600), 10.0, note)
+            cpu = cpu_of(node.pid)
+            while not compiled and time.monotonic() < start + 240.0:
+                session.sleep(0.2)
+                note()
+        finally:
+            for process in beside:
+                process.kill()
+                process.wait()
+    words = f'{len(cores)}{", busy" if is_busy else ""}'
+    seconds = f'{compiled[0]:.0f}' if compiled else '-'
+    return {'cores': words, **found, 'CPU [s]': f'{cpu:.1f}', 'numba after [s]': seconds}
 
 
 def read_scans(path, n_wanted, topic):
     """Points of the first scans of a KITTI folder, or of what `segment` takes."""
-    folders = sorted(path.glob('sequences/*/velodyne')) or [path]
-    items = (item for folder in folders for item in list_inputs(folder, topic=topic))
-    clouds = [item.read().xyz[:, :3] for item in itertools.islice(items, n_wanted)]
-    return [np.insert(xyz, 3, 1.0, axis=1).astype(np.float32) for xyz in clouds]
+    if topic is None and any(path.glob('sequences/*/velodyne')):
+        frames = labelled_frames(path)[:n_wanted]
+        return [frame.points for frame in frames]
+    inputs = list_inputs(path, 4, topic)
+    clouds = [item.read().xyz for item in itertools.islice(inputs, n_wanted)]
+    return [np.column_stack([xyz, np.ones(len(xyz))]).astype(np.float32) for xyz in clouds]
 
 
 def main():
@@ -161,6 +208,7 @@ def main():
     parser.add_argument('--rates', type=float, nargs='+', default=[10.0, 20.0, 50.0])
     parser.add_argument('--frames', type=int, default=600, help='clouds sent at each rate')
     parser.add_argument('--sensor', choices=SENSORS, default='hdl-64e', help='that is simulated')
+    parser.add_argument('--first-minute', action='store_true')
     given = parser.parse_args(words)
     if given.data:
         scans = read_scans(Path(given.data), given.clouds, given.topic)
@@ -170,7 +218,14 @@ def main():
             .points for k in range(N_SIMULATED)
         ]  # fmt: skip
     clouds = [scan_cloud(points, 0, FRAME_ID) for points in scans]
-    rates = measure(clouds, given.rates, given.frames, ros_args)
+    if given.first_minute:
+        every = os.sched_getaffinity(0)
+        rates = [
+            first_minute(clouds, cores, is_busy, ros_args)
+            for cores, is_busy in ((every, False), ({min(every)}, False), (every, True))
+        ]
+    else:
+        rates = measure(clouds, given.rates, given.frames, ros_args)
     n_points = sum(map(len, scans)) / len(scans)
     source = given.data or f'simulated {given.sensor}'
     print(f'{source}: {len(scans)} clouds of {n_points:.0f} points')
