@@ -57,17 +57,17 @@ class SegmentSurfaces(NamedTuple):
 class _Columns(NamedTuple):
     """State of the candidates of a segment, or of its inliers and the knots; one column each."""
 
-    r: FloatArray  # (size,) float32, ranges [m]
+    r: FloatArray  # (size,) ranges [m]
     length_scale: FloatArray  # (size,) float32 [m]
-    height: FloatArray  # (size,) float32, prediction about the prior mean [m]
-    variance: FloatArray  # (size,) float32, its variance [m^2]
+    height: FloatArray  # (size,) prediction about the prior mean [m]
+    variance: FloatArray  # (size,) its variance [m^2]
     z: FloatArray  # (n,) heights of the candidates about the prior mean [m]
     noise: FloatArray  # (n,) variances of the noise with which they are observed [m^2]
     neighbour_height: FloatArray  # (n,) evidence at the candidates [m]
     neighbour_precision: FloatArray  # (n,) its precision [1/m^2]
     above: BoolArray  # (n,) candidates that the evidence contradicts
     new: IntArray  # (n,) candidates that join in this round
-    whitened: FloatArray  # (n, size) float32, one row for each inlier
+    whitened: FloatArray  # (n, size) one row for each inlier
 
 
 class _Prior(NamedTuple):
@@ -97,13 +97,13 @@ def _make_columns(frame: Frame, step: int, n_knots: int, precision: Any) -> _Col
     for m in range(0, len(offsets) - 1, step):
         most = max(most, offsets[m + 1] - offsets[m])
     width = (most + n_knots + LANES - 1) & -LANES
-    single, table = np.empty((4, width), precision), np.empty((4, most))
+    of_columns, table = np.empty((3, width), precision), np.empty((4, most))
     # One by one, so that the compiler knows them to be contiguous.
     return _Columns(
-        single[0],
-        single[1],
-        single[2],
-        single[3],
+        of_columns[0],
+        np.empty(width, np.float32),
+        of_columns[1],
+        of_columns[2],
         table[0],
         table[1],
         table[2],
@@ -335,14 +335,15 @@ def _observe(
 ) -> None:
     """Condition the columns from `near` on on candidate i: one more row of `whitened`."""
     r, length_scale, whitened = columns.r, columns.length_scale, columns.whitened
-    row, r_i, l_i = whitened[n_inliers], r[i], length_scale[i]
-    number = row.dtype.type
-    sill, slope, sixth = number(prior.sill), number(prior.slope), number(prior.sixth)
+    row, r_i, l_i, sill = whitened[n_inliers], r[i], length_scale[i], np.float32(prior.sill)
+    number, zero = row.dtype.type, np.float32(0.0)
+    slope, sixth = number(prior.slope), number(prior.sixth)
     # Unsigned, as a signed index could count from the end.
     start, end = np.uintp(near), np.uintp(size)
-    # Prior covariance of column i with the others (paper, eq. 8).
+    # Prior covariance of column i with the others (paper, eq. 8): that of the process always is of
+    # single precision, by differences of ranges in their own.
     for j in range(start, end):
-        row[j] = paciorek(r_i, l_i, r[j], length_scale[j], sill)
+        row[j] = paciorek(np.float32(r_i - r[j]), l_i, zero, length_scale[j], sill)
         row[j] += line_covariance(r_i, r[j], slope, sixth)
     # Subtract the projection on the rows before, four rows at a time, so that the
     # new row is read and written once for all of them.
