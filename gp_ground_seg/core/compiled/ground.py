@@ -335,34 +335,36 @@ def _observe(
 ) -> None:
     """Condition the columns from `near` on on candidate i: one more row of `whitened`."""
     r, length_scale, whitened = columns.r, columns.length_scale, columns.whitened
-    row, r_i, l_i, sill = whitened[n_inliers], r[i], length_scale[i], np.float32(prior.sill)
-    number, zero = row.dtype.type, np.float32(0.0)
+    r_i, l_i, sill, zero = r[i], length_scale[i], np.float32(prior.sill), np.float32(0.0)
+    number = r.dtype.type
     slope, sixth = number(prior.slope), number(prior.sixth)
-    # Unsigned, as a signed index could count from the end.
-    start, end = np.uintp(near), np.uintp(size)
+    # Unsigned indices: see `numerics`.
+    start, end, own, n = np.uintp(near), np.uintp(size), np.uintp(i), np.uintp(n_inliers)
+    one, two, three, four = np.uintp(1), np.uintp(2), np.uintp(3), np.uintp(4)
     # Prior covariance of column i with the others (paper, eq. 8): that of the process always is of
     # single precision, by differences of ranges in their own.
     for j in range(start, end):
-        row[j] = paciorek(np.float32(r_i - r[j]), l_i, zero, length_scale[j], sill)
-        row[j] += line_covariance(r_i, r[j], slope, sixth)
+        process = paciorek(np.float32(r_i - r[j]), l_i, zero, length_scale[j], sill)
+        whitened[n, j] = process + line_covariance(r_i, r[j], slope, sixth)
     # Subtract the projection on the rows before, four rows at a time, so that the
     # new row is read and written once for all of them.
-    for k in range(0, n_inliers - 3, 4):
-        row_0, row_1 = whitened[k], whitened[k + 1]
-        row_2, row_3 = whitened[k + 2], whitened[k + 3]
-        w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
+    for k in range(np.uintp(0), n & ~three, four):
+        w_0, w_1 = whitened[k, own], whitened[k + one, own]
+        w_2, w_3 = whitened[k + two, own], whitened[k + three, own]
         for j in range(start, end):
-            row[j] -= w_0 * row_0[j] + w_1 * row_1[j] + w_2 * row_2[j] + w_3 * row_3[j]
-    for k in range(n_inliers & -4, n_inliers):
-        row_0, w_0 = whitened[k], whitened[k, i]
+            known = w_0 * whitened[k, j] + w_1 * whitened[k + one, j]
+            known = known + w_2 * whitened[k + two, j] + w_3 * whitened[k + three, j]
+            whitened[n, j] -= known
+    for k in range(n & ~three, n):
+        w_0 = whitened[k, own]
         for j in range(start, end):
-            row[j] -= w_0 * row_0[j]
+            whitened[n, j] -= w_0 * whitened[k, j]
     height, variance = columns.height, columns.variance
     precision = 1.0 / (max(variance[i], 0.0) + columns.noise[i])
     scale = number(math.sqrt(precision))
     innovation = number(columns.z[i] - height[i]) * scale
     for j in range(start, end):
-        value = row[j] * scale
-        row[j] = value
+        value = whitened[n, j] * scale
+        whitened[n, j] = value
         height[j] += value * innovation
         variance[j] -= value * value
