@@ -293,10 +293,11 @@ def reachable(
     """See the plain `reachable`."""
     r, n = candidates.r, len(candidates.r)
     allowed, is_raised = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    is_entry, is_fallen = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
     for c in range(n):
         allowed[c] = r[c] < REACH and not is_face[np.uintp(candidates.tile[c])]
         is_raised[c] = candidates.z[c] + height > RAISED
-    walk = _Walk(np.arange(n), is_raised, np.arange(n), np.zeros(n, np.bool_), np.zeros(n, np.bool_))
+    walk = _Walk(np.arange(n), is_raised, np.arange(n), is_entry, is_fallen)
     steep, down = _step_along(candidates, allowed, walk)
     for aside in range(1, N_ASIDE + 1):
         _step_aside(candidates, allowed, aside, walk)
