@@ -109,7 +109,10 @@ def _find_seeds(
     # Twice around, either way, as the segments form a ring.
     for step in (1, -1):
         for k in range(1, 2 * n_segments):
-            _rise_from(table, step * k % n_segments, step * (k - 1) % n_segments, rise)
+            # Unsigned, as a signed index could count from the end.
+            to, by = np.uintp(step * k % n_segments), np.uintp(step * (k - 1) % n_segments)
+            for j in range(np.uintp(n_bins)):
+                table[to, j] = min(table[to, j], table[by, j] + rise[j])
     _rise_along(table, n_bins, max_slope, knots)
     n_standing = n_near = 0
     sigma_n = math.exp(theta[1])
@@ -123,16 +126,6 @@ def _find_seeds(
                 n_near += not frame.in_face[i]
     odds: float = odds_of(n_standing, n_near)
     return odds
-
-
-@jit()
-def _rise_from(table: FloatArray, m: int, other: int, rise: FloatArray) -> None:
-    """Let the ground rise from one segment to the next."""
-    # Unsigned, as a signed index could count from the end.
-    to, by = np.uintp(m), np.uintp(other)
-    for j in range(np.uintp(0), np.uintp(len(rise))):
-        highest = table[by, j] + rise[j]
-        table[to, j] = highest if highest < table[to, j] else table[to, j]
 
 
 @jit()

@@ -57,17 +57,17 @@ class SegmentSurfaces(NamedTuple):
 class _Columns(NamedTuple):
     """State of the candidates of a segment, or of its inliers and the knots; one column each."""
 
-    r: FloatArray  # (size,) float32, ranges [m]
+    r: FloatArray  # (size,) ranges [m]
     length_scale: FloatArray  # (size,) float32 [m]
-    height: FloatArray  # (size,) float32, prediction about the prior mean [m]
-    variance: FloatArray  # (size,) float32, its variance [m^2]
+    height: FloatArray  # (size,) prediction about the prior mean [m]
+    variance: FloatArray  # (size,) its variance [m^2]
     z: FloatArray  # (n,) heights of the candidates about the prior mean [m]
     noise: FloatArray  # (n,) variances of the noise with which they are observed [m^2]
     neighbour_height: FloatArray  # (n,) evidence at the candidates [m]
     neighbour_precision: FloatArray  # (n,) its precision [1/m^2]
     above: BoolArray  # (n,) candidates that the evidence contradicts
     new: IntArray  # (n,) candidates that join in this round
-    whitened: FloatArray  # (n, size) float32, one row for each inlier
+    whitened: FloatArray  # (n, size) one row for each inlier
 
 
 class _Prior(NamedTuple):
@@ -97,13 +97,13 @@ def _make_columns(frame: Frame, step: int, n_knots: int, precision: Any) -> _Col
     for m in range(0, len(offsets) - 1, step):
         most = max(most, offsets[m + 1] - offsets[m])
     width = (most + n_knots + LANES - 1) & -LANES
-    single, table = np.empty((4, width), precision), np.empty((4, most))
+    of_columns, table = np.empty((3, width), precision), np.empty((4, most))
     # One by one, so that the compiler knows them to be contiguous.
     return _Columns(
-        single[0],
-        single[1],
-        single[2],
-        single[3],
+        of_columns[0],
+        np.empty(width, np.float32),
+        of_columns[1],
+        of_columns[2],
         table[0],
         table[1],
         table[2],
@@ -335,33 +335,36 @@ def _observe(
 ) -> None:
     """Condition the columns from `near` on on candidate i: one more row of `whitened`."""
     r, length_scale, whitened = columns.r, columns.length_scale, columns.whitened
-    row, r_i, l_i = whitened[n_inliers], r[i], length_scale[i]
-    number = row.dtype.type
-    sill, slope, sixth = number(prior.sill), number(prior.slope), number(prior.sixth)
-    # Unsigned, as a signed index could count from the end.
-    start, end = np.uintp(near), np.uintp(size)
-    # Prior covariance of column i with the others (paper, eq. 8).
+    r_i, l_i, sill, zero = r[i], length_scale[i], np.float32(prior.sill), np.float32(0.0)
+    number = r.dtype.type
+    slope, sixth = number(prior.slope), number(prior.sixth)
+    # Unsigned indices: see `numerics`.
+    start, end, own, n = np.uintp(near), np.uintp(size), np.uintp(i), np.uintp(n_inliers)
+    one, two, three, four = np.uintp(1), np.uintp(2), np.uintp(3), np.uintp(4)
+    # Prior covariance of column i with the others (paper, eq. 8): that of the process always is of
+    # single precision, by differences of ranges in their own.
     for j in range(start, end):
-        row[j] = paciorek(r_i, l_i, r[j], length_scale[j], sill)
-        row[j] += line_covariance(r_i, r[j], slope, sixth)
+        process = paciorek(np.float32(r_i - r[j]), l_i, zero, length_scale[j], sill)
+        whitened[n, j] = process + line_covariance(r_i, r[j], slope, sixth)
     # Subtract the projection on the rows before, four rows at a time, so that the
     # new row is read and written once for all of them.
-    for k in range(0, n_inliers - 3, 4):
-        row_0, row_1 = whitened[k], whitened[k + 1]
-        row_2, row_3 = whitened[k + 2], whitened[k + 3]
-        w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
+    for k in range(np.uintp(0), n & ~three, four):
+        w_0, w_1 = whitened[k, own], whitened[k + one, own]
+        w_2, w_3 = whitened[k + two, own], whitened[k + three, own]
         for j in range(start, end):
-            row[j] -= w_0 * row_0[j] + w_1 * row_1[j] + w_2 * row_2[j] + w_3 * row_3[j]
-    for k in range(n_inliers & -4, n_inliers):
-        row_0, w_0 = whitened[k], whitened[k, i]
+            known = w_0 * whitened[k, j] + w_1 * whitened[k + one, j]
+            known = known + w_2 * whitened[k + two, j] + w_3 * whitened[k + three, j]
+            whitened[n, j] -= known
+    for k in range(n & ~three, n):
+        w_0 = whitened[k, own]
         for j in range(start, end):
-            row[j] -= w_0 * row_0[j]
+            whitened[n, j] -= w_0 * whitened[k, j]
     height, variance = columns.height, columns.variance
     precision = 1.0 / (max(variance[i], 0.0) + columns.noise[i])
     scale = number(math.sqrt(precision))
     innovation = number(columns.z[i] - height[i]) * scale
     for j in range(start, end):
-        value = row[j] * scale
-        row[j] = value
+        value = whitened[n, j] * scale
+        whitened[n, j] = value
         height[j] += value * innovation
         variance[j] -= value * value

@@ -193,7 +193,7 @@ def _vote(
 
     `lowest` is that of `lowest_of` [m].
     """
-    margins, unit = result.margin, config.ground_tolerance / VOTE_UNITS
+    margins, tolerance = result.margin, config.ground_tolerance
     has_obstacle, outside = np.zeros(len(scan.tiles.place) + 1, np.bool_), len(scan.tiles.place)
     for i in range(len(near_tile)):
         has_obstacle[np.uintp(near_tile[i] if margins[i] < 0.0 else outside)] = True
@@ -204,7 +204,14 @@ def _vote(
         voters[np.uintp(n)] = i
         n += np.int64(rows[np.uintp(near_tile[i])] > 0)
     voters, places = voters[:n], np.empty(n, np.int32)
-    votes = _count_votes(scan, voters, near_tile, rows, n_rows, lowest, config, margins, places)
+    # The sum of the votes in each layer of each row, whole numbers.
+    votes = np.zeros(n_rows * N_LAYERS, np.int64)
+    for k in range(n):
+        i = np.uintp(voters[k])
+        layer = np.int32(layer_of(np.float64(scan.xyz[2, i]) - lowest, tolerance))
+        places[k] = rows[np.uintp(near_tile[i])] * np.int32(N_LAYERS) + layer
+        vote = vote_of(np.float64(margins[i]), tolerance)
+        votes[np.uintp(places[k])] += VOTER_FLAG + np.int64(vote + VOTE_UNITS)
     sums = _sum_around(around, votes)
     for k in range(n):
         layer = places[k] % N_LAYERS
@@ -215,7 +222,7 @@ def _vote(
             total += sums[np.uintp(places[k] - layer + (layer + step) % N_LAYERS)]
         number = total // VOTER_FLAG
         mean = (total - number * VOTER_FLAG) / number - VOTE_UNITS
-        margins[i] = margin_after_vote(np.float64(margins[i]), mean * unit)
+        margins[i] = margin_after_vote(np.float64(margins[i]), mean * (tolerance / VOTE_UNITS))
         result.label[i] = _GROUND if margins[i] >= 0.0 else _OBSTACLE
 
 
@@ -247,30 +254,6 @@ def _number_tiles(tiles: Tiles, has_obstacle: BoolArray) -> tuple[CellArray, Cel
                     around[rows[t], n] = rows[np.uintp(beside)]
                     n += 1
     return rows, around, n_rows
-
-
-@jit()
-def _count_votes(
-    scan: Scan,
-    voters: CellArray,
-    near_tile: CellArray,
-    rows: CellArray,
-    n_rows: int,
-    lowest: float,
-    config: LabelConfig,
-    margins: PointArray,
-    places: CellArray,
-) -> IntArray:
-    """Add up the votes in each layer of each row, whole numbers, and set the place of each."""
-    votes, tolerance = np.zeros(n_rows * N_LAYERS, np.int64), config.ground_tolerance
-    for k in range(len(voters)):
-        i = np.uintp(voters[k])
-        over_lowest = np.float64(scan.xyz[2, i]) - lowest
-        layer = np.int32(layer_of(over_lowest, tolerance))
-        places[k] = rows[np.uintp(near_tile[i])] * np.int32(N_LAYERS) + layer
-        vote = vote_of(np.float64(margins[i]), tolerance)
-        votes[np.uintp(places[k])] += VOTER_FLAG + np.int64(vote + VOTE_UNITS)
-    return votes
 
 
 @jit(part=True)

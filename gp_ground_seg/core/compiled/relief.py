@@ -73,7 +73,7 @@ def find_relief(
     below, is_known_below = land, np.zeros(_N_SQUARES, np.bool_)
     if behind.any():
         below, is_known_below = _fit_planes(candidates, behind, height)
-    if max(_highest(land, is_known), _highest(below, is_known_below)) <= FADED:
+    if max(np.abs(land).max(), np.abs(below).max()) <= FADED:
         return True
     is_behind = np.zeros(_N_SQUARES, np.bool_)
     if is_known_below.any():
@@ -83,15 +83,6 @@ def find_relief(
     for c in range(len(z)):
         z[c] = candidates.z[c] - height_at(pieces, candidates.x[c], candidates.y[c])
     return False
-
-
-@jit()
-def _highest(land: FloatArray, is_known: BoolArray) -> float:
-    """Greatest height or depth of the land that is known [m]."""
-    highest = 0.0
-    for k in range(_N_SQUARES):
-        highest = max(highest, abs(land[k])) if is_known[k] else highest
-    return highest
 
 
 @jit()
@@ -165,7 +156,10 @@ def _place(i: int, j: int) -> int:
 def _fit_planes(
     candidates: Candidates, reached: BoolArray, height: float
 ) -> tuple[FloatArray, BoolArray]:
-    """Heights of the land in all squares, and which are known. See the plain `fit_planes`."""
+    """Heights of the land in all squares, 0 where unknown, and which are known.
+
+    See the plain `fit_planes`.
+    """
     x, y, z = candidates.x, candidates.y, candidates.z
     square, number = np.empty(len(x), np.int64), np.zeros(_N_SQUARES, np.int64)
     for c in range(len(x)):
@@ -299,10 +293,11 @@ def reachable(
     """See the plain `reachable`."""
     r, n = candidates.r, len(candidates.r)
     allowed, is_raised = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    is_entry, is_fallen = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
     for c in range(n):
         allowed[c] = r[c] < REACH and not is_face[np.uintp(candidates.tile[c])]
         is_raised[c] = candidates.z[c] + height > RAISED
-    walk = _Walk(_trees(n), is_raised, _trees(n), np.zeros(n, np.bool_), np.zeros(n, np.bool_))
+    walk = _Walk(np.arange(n), is_raised, np.arange(n), is_entry, is_fallen)
     steep, down = _step_along(candidates, allowed, walk)
     for aside in range(1, N_ASIDE + 1):
         _step_aside(candidates, allowed, aside, walk)
@@ -432,7 +427,7 @@ def _step_in_front(candidates: Candidates, steep: IntArray, walk: _Walk) -> None
             segment[k] = m
             k += 1
         starts[m + 1] = k
-    front = _trees(len(steep))
+    front = np.arange(len(steep))
     for aside in range(1, N_ASIDE + 1):
         for k in range(len(steep)):
             beside = (segment[k] + aside) % n_segments
@@ -490,15 +485,6 @@ def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, walk: _W
                     distance = math.sqrt(dr * dr + across * across)
                     if can_step(distance, z[there] - z[c], GENTLE):
                         _step(walk, c, there)
-
-
-@jit()
-def _trees(n: int) -> IntArray:
-    """Trees of one member each."""
-    parent = np.empty(n, np.int64)
-    for c in range(n):
-        parent[c] = c
-    return parent
 
 
 @jit()

@@ -121,7 +121,14 @@ def _sum_returns(
     tile_to_row: CellArray,
 ) -> FloatArray:
     """Sum over the returns, (3, N), in tall tiles: (2 * K, N_COLUMNS)."""
-    sums = _no_sums(tiles, tall, tile_size)
+    n_sides, sums = int(math.sqrt(len(tiles.at))), np.zeros((2 * len(tall), N_COLUMNS))
+    half = 0.5 * n_sides * tile_size
+    for k in range(len(tall)):
+        place = tiles.place[tall[k]]
+        # About a point of the tile: about the sensor, rounding would exceed the scatter.
+        sums[2 * k, _X] = in_units((place // n_sides) * tile_size - half)
+        sums[2 * k, _Y] = in_units((place % n_sides) * tile_size - half)
+        sums[2 * k, _BASE] = tiles.extremes[tall[k], 0]
     foot_height, max_height = label.ground_tolerance, label.obstacle_max_height
     x, y, z, tile = columns[0], columns[1], columns[2], tiles.tile
     for i in range(len(tile)):
@@ -149,18 +156,4 @@ def _sum_returns(
         s[8] += dx * dz
         s[9] += dy * dz
         s[_TOP] = max(s[_TOP], above)
-    return sums
-
-
-@jit()
-def _no_sums(tiles: Tiles, tall: CellArray, tile_size: float) -> FloatArray:
-    """Lay out the sums of no returns, with the origins of the tall tiles."""
-    n_sides, sums = int(math.sqrt(len(tiles.at))), np.zeros((2 * len(tall), N_COLUMNS))
-    half = 0.5 * n_sides * tile_size
-    for k in range(len(tall)):
-        place = tiles.place[tall[k]]
-        # About a point of the tile: about the sensor, rounding would exceed the scatter.
-        sums[2 * k, _X] = in_units((place // n_sides) * tile_size - half)
-        sums[2 * k, _Y] = in_units((place % n_sides) * tile_size - half)
-        sums[2 * k, _BASE] = tiles.extremes[tall[k], 0]
     return sums
