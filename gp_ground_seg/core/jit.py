@@ -151,6 +151,12 @@ def _entry_compiler() -> Any:
     from numba.core.compiler import Compiler
 
     class Part(JITCodeLibrary):  # type: ignore[misc]
+        def _optimize_functions(self, ll_module: Any) -> None:
+            ll_module.data_layout = self._codegen._data_layout
+            passes, builder = self._codegen._function_pass_manager(opt=1)
+            for function in ll_module.functions:
+                passes.run(function, builder)
+
         def _optimize_final_module(self) -> None:
             pass
 
