@@ -3,7 +3,7 @@
 numba keeps compiled code itself (``cache=True``), here in a folder of the user that is named by
 our sources and by versions: code of other sources is never read. Each function has a checksum of
 its files: what is damaged, as after a power cut, is compiled again. Of several processes one
-compiles, and the others wait for its files.
+compiles a function, and the others wait for its files.
 """
 
 from __future__ import annotations
@@ -38,10 +38,9 @@ _Function = TypeVar('_Function', bound=Callable[..., Any])
 _CORE = Path(__file__).parent
 _entry_points: list[Any] = []
 _shared: list[Callable[..., Any]] = []
-_ALL, _LOCK = 'all', 'lock'
-_CHECKSUM = '.sha256'
+_ALL, _CHECKSUM, _LOCK = 'all', '.sha256', '.lock'
 _kept: set[str] = set()  # checksums of the functions that this process has read or written
-_turn: IO[bytes] | None = None  # the file that is locked while a process compiles
+_turn: IO[bytes] | None = None  # the file that is locked while a function is compiled
 _patience = 120.0  # longest wait for others, in all [s]: one may be suspended
 
 
@@ -216,7 +215,7 @@ def _load(load: Callable[..., Any], folder: Path, checksum: Path, *arguments: An
     """Let numba `load` code if its files are whole; None where it has to compile."""
     with contextlib.suppress(OSError):
         if not _is_whole(checksum):
-            _begin_turn(folder)
+            _begin_turn(checksum)
             if not _is_whole(checksum):
                 for path in _files_of(checksum):
                     path.unlink(missing_ok=True)
@@ -224,7 +223,7 @@ def _load(load: Callable[..., Any], folder: Path, checksum: Path, *arguments: An
             _list(folder, checksum)
             _end_turn()  # another process has compiled it meanwhile
             return found
-    _begin_turn(folder)
+    _begin_turn(checksum)
     log_once(logging.WARNING, 'compiling once for this processor, which takes 20 to 60 s')
     return None
 
@@ -270,11 +269,11 @@ def _list(folder: Path, checksum: Path) -> None:
             (folder / _ALL).write_text('\n'.join(sorted(_kept)))
 
 
-def _begin_turn(folder: Path) -> None:
-    """Wait until no other process compiles, or the patience is at an end."""
+def _begin_turn(checksum: Path) -> None:
+    """Wait until no other process compiles this function, or the patience is at an end."""
     global _turn, _patience
     with contextlib.suppress(OSError):  # the disk is full, or has no locks
-        _turn = _turn or (folder / _LOCK).open('ab')
+        _turn = _turn or checksum.with_suffix(_LOCK).open('ab')
         while _patience > 0.0:
             try:
                 return fcntl.flock(_turn, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -284,7 +283,7 @@ def _begin_turn(folder: Path) -> None:
 
 
 def _end_turn() -> None:
-    """Let another process compile."""
+    """Let another process compile the function."""
     global _turn
     if _turn is not None:
         with contextlib.suppress(OSError):
