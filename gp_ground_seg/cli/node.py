@@ -54,7 +54,7 @@ def main_managed() -> int:
 def run_warm_up(_arguments: argparse.Namespace) -> int:
     """Compile all code that a frame needs, in this process."""
     from gp_ground_seg.core.jit import HAVE_NUMBA, code_folder
-    from gp_ground_seg.core.segmenter import warm_up
+    from gp_ground_seg.ros.loader import compile_all
 
     if not HAVE_NUMBA:
         raise MissingDependencyError(
@@ -62,7 +62,7 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
         )
     options.note('compiling what is not on disk yet: 20 to 60 s for all of it')
     begin = time.monotonic()
-    warm_up()
+    compile_all()
     seconds, folder = time.monotonic() - begin, code_folder()
     if folder is None:
         raise GroundSegError('compiled code is not kept on disk, see the note above')

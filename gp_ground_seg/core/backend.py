@@ -75,6 +75,14 @@ def make_backend(runtime: RuntimeConfig) -> Backend:
     return NumbaBackend()
 
 
+def make_later_backend() -> Backend:
+    """Return a backend whose stages between grid and learning are numpy's, not to be compiled."""
+    backend = make_backend(RuntimeConfig())
+    for stage in ('fit_plane', 'find_faces', 'find_relief', 'extract_lines'):
+        setattr(backend, stage, getattr(NumpyBackend, stage))
+    return backend
+
+
 def _warn_slow(reason: str, more: object) -> None:
     text = 'numba %s: using numpy, several times slower (%s)'
     log_once(logging.WARNING, text, reason, more)

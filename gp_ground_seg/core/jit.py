@@ -3,7 +3,7 @@
 numba keeps compiled code itself (``cache=True``), here in a folder of the user that is named by
 our sources and by versions: code of other sources is never read. Each function has a checksum of
 its files: what is damaged, as after a power cut, is compiled again. Of several processes one
-compiles, and the others wait for its files.
+compiles a function, and the others wait for its files.
 """
 
 from __future__ import annotations
@@ -38,10 +38,9 @@ _Function = TypeVar('_Function', bound=Callable[..., Any])
 _CORE = Path(__file__).parent
 _entry_points: list[Any] = []
 _shared: list[Callable[..., Any]] = []
-_ALL, _LOCK = 'all', 'lock'
-_CHECKSUM = '.sha256'
+_ALL, _CHECKSUM, _LOCK = 'all', '.sha256', '.lock'
 _kept: set[str] = set()  # checksums of the functions that this process has read or written
-_turn: IO[bytes] | None = None  # the file that is locked while a process compiles
+_turn: IO[bytes] | None = None  # the file that is locked while a function is compiled
 _patience = 120.0  # longest wait for others, in all [s]: one may be suspended
 
 
@@ -140,23 +139,68 @@ def jit(
     return decorate
 
 
+@functools.cache
+def _entry_compiler() -> Any:
+    """Return the compiler of numba, but what an entry calls is machine code in the entry alone.
+
+    It would be optimised and made machine code by itself too, and again in each of its callers.
+    numba has no public hook here; a numba without these names takes longer.
+    """
+    from numba.core.codegen import JITCodeLibrary
+    from numba.core.compiler import Compiler
+
+    class Part(JITCodeLibrary):  # type: ignore[misc]
+        def _optimize_functions(self, ll_module: Any) -> None:
+            ll_module.data_layout = self._codegen._data_layout
+            passes, builder = self._codegen._function_pass_manager(opt=1)
+            for function in ll_module.functions:
+                passes.run(function, builder)
+
+        def _optimize_final_module(self) -> None:
+            pass
+
+        def _finalize_final_module(self) -> None:
+            self._finalized = True
+
+        def get_pointer_to_function(self, name: str) -> int:
+            return 0
+
+        # The environment is set in machine code, which there is none of.
+        codegen = property(lambda self: self)
+        set_env = lambda *_: None  # noqa: E731
+
+    class EntryCompiler(Compiler):  # type: ignore[misc]
+        def compile_extra(self, func: Callable[..., Any]) -> Any:
+            codegen = self.state.targetctx.codegen()
+            self.state.library = codegen.create_library(func.__qualname__)
+            self.state.library.enable_object_caching()
+            codegen._library_class = Part
+            try:
+                return super().compile_extra(func)
+            finally:
+                del codegen._library_class
+
+    return EntryCompiler
+
+
 def _njit_kept(function: Callable[..., Any]) -> Any:
     """Compile `function` with its code kept on disk, if there is a folder to trust for it."""
     import numba
 
+    options = _options() | {'pipeline_class': _entry_compiler()}
     folder = code_folder()
     if folder is None:
-        return numba.njit(**_options())(function)
+        return numba.njit(**options)(function)
     # numba reads this once, here. Without it, code would lie beside our sources.
     before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
     try:
-        kept = numba.njit(**_options(), cache=True)(function)
+        kept = numba.njit(**options, cache=True)(function)
     finally:
         numba.config.CACHE_DIR = before
     place = Path(kept.stats.cache_path)
     if folder not in place.parents:
         _log_not_kept(f'{folder} cannot be written to')
-        return numba.njit(**_options())(function)
+        return numba.njit(**options)(function)
     # numba has no public hook here; a numba without these names keeps code without checksums.
     cache: Any = getattr(kept, '_cache', None)
     module = Path(function.__code__.co_filename).stem
@@ -171,7 +215,7 @@ def _load(load: Callable[..., Any], folder: Path, checksum: Path, *arguments: An
     """Let numba `load` code if its files are whole; None where it has to compile."""
     with contextlib.suppress(OSError):
         if not _is_whole(checksum):
-            _begin_turn(folder)
+            _begin_turn(checksum)
             if not _is_whole(checksum):
                 for path in _files_of(checksum):
                     path.unlink(missing_ok=True)
@@ -179,7 +223,7 @@ def _load(load: Callable[..., Any], folder: Path, checksum: Path, *arguments: An
             _list(folder, checksum)
             _end_turn()  # another process has compiled it meanwhile
             return found
-    _begin_turn(folder)
+    _begin_turn(checksum)
     log_once(logging.WARNING, 'compiling once for this processor, which takes 20 to 60 s')
     return None
 
@@ -225,11 +269,11 @@ def _list(folder: Path, checksum: Path) -> None:
             (folder / _ALL).write_text('\n'.join(sorted(_kept)))
 
 
-def _begin_turn(folder: Path) -> None:
-    """Wait until no other process compiles, or the patience is at an end."""
+def _begin_turn(checksum: Path) -> None:
+    """Wait until no other process compiles this function, or the patience is at an end."""
     global _turn, _patience
     with contextlib.suppress(OSError):  # the disk is full, or has no locks
-        _turn = _turn or (folder / _LOCK).open('ab')
+        _turn = _turn or checksum.with_suffix(_LOCK).open('ab')
         while _patience > 0.0:
             try:
                 return fcntl.flock(_turn, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -239,7 +283,7 @@ def _begin_turn(folder: Path) -> None:
 
 
 def _end_turn() -> None:
-    """Let another process compile."""
+    """Let another process compile the function."""
     global _turn
     if _turn is not None:
         with contextlib.suppress(OSError):

@@ -344,7 +344,7 @@ def _refused(name: str, value: object, wanted: str) -> ConfigError:
     return ConfigError(f'{name} = {shown}: must be {wanted}')
 
 
-def warm_up(config: Config | None = None) -> Backend:
+def warm_up(config: Config | None = None, backend: Backend | None = None) -> Backend:
     """Compile or load all code that a frame needs, and return a backend that uses it.
 
     A small scan of single precision, the type of most sensors, is segmented, and hyper-parameters
@@ -352,7 +352,8 @@ def warm_up(config: Config | None = None) -> Backend:
     ``runtime.backend`` is numba and numba is not installed.
     """
     config = config or Config()
-    segmenter = GroundSegmenter(config.replace(**{'learning.mode': 'every_frame'}))
+    config = config.replace(**{'learning.mode': 'every_frame'})
+    segmenter = GroundSegmenter(config, backend=backend)
     azimuth, r = np.meshgrid(np.linspace(-3.0, 3.0, 400), np.geomspace(2.5, 30.0, 30))
     xyz = np.stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full_like(r, -1.73)], axis=-1)
     wall = xyz[25] + [0.0, 0.0, 1.0]

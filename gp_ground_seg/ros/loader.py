@@ -9,12 +9,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
+from gp_ground_seg.core import jit, segmenter
+from gp_ground_seg.core.backend import Backend
 from gp_ground_seg.core.parameters.config import Config
-
-if TYPE_CHECKING:
-    from gp_ground_seg.core.backend import Backend
 
 FOLLOWS = (
     'segmenting with numpy until the compiled code is there: a second, or 20 to 60 s to compile it'
@@ -25,8 +23,11 @@ JOIN_TIMEOUT = 0.5  # longest wait for the thread [s]
 
 # Behind what the robot does, a little. Collecting garbage less often, as the commands do, saves a
 # tenth of the time.
-_COMPILE = 'import gc; gc.set_threshold(50_000); os.nice(1); ' + (
-    'from gp_ground_seg.core.segmenter import warm_up; warm_up()'
+_POLITELY = 'import gc; gc.set_threshold(50_000); os.nice(1); '
+_COMPILE = _POLITELY + 'from gp_ground_seg.ros.loader import compile_all; compile_all()'
+_COMPILE_LATER = _POLITELY + (
+    'from gp_ground_seg.core import backend, segmenter; '
+    'segmenter.warm_up(backend=backend.make_later_backend())'
 )
 _CHILD = """\
 import os, signal, sys, threading
@@ -46,6 +47,17 @@ def child_command(code: str) -> list[str]:
     """
     path = [entry for entry in sys.path if os.path.isabs(entry)]
     return [sys.executable, '-c', _CHILD.format(path=path, code=code)]
+
+
+def compile_all() -> None:
+    """Compile all code that a frame needs; where there are two cores, in two processes."""
+    if len(os.sched_getaffinity(0)) > 1 and jit.has_to_compile():
+        # Where it fails, this process compiles that too.
+        command, pipe, nowhere = child_command(_COMPILE_LATER), subprocess.PIPE, subprocess.DEVNULL
+        with subprocess.Popen(command, cwd='/', stdin=pipe, stderr=nowhere):
+            segmenter.warm_up()
+    else:
+        segmenter.warm_up()
 
 
 class BackendLoader(threading.Thread):
@@ -85,15 +97,13 @@ class BackendLoader(threading.Thread):
         try:
             # It declares the compiled functions: then it is known which of them are on disk.
             import gp_ground_seg.core.compiled.backend  # noqa: F401
-            from gp_ground_seg.core.jit import code_folder, is_code_kept
-            from gp_ground_seg.core.segmenter import warm_up
 
-            if code_folder() is not None and not is_code_kept():
+            if jit.code_folder() is not None and not jit.is_code_kept():
                 self._compile()
             if not self._is_closed:
                 # Not with a given height: the scan that is segmented here has another.
                 config = dataclasses.replace(self._config, sensor=Config().sensor)
-                self.backend = warm_up(config)
+                self.backend = segmenter.warm_up(config)
         except Exception as error:
             self.error = f'{type(error).__name__}: {error}'
         self.seconds = time.monotonic() - start

@@ -196,7 +196,7 @@ def test_one_process_compiles_and_others_wait_for_its_files(program):
     assert sum(hits for _, hits, *_ in found) == 4
     # One that is suspended, or hangs, is not waited for without end.
     program.code().unlink()
-    with next(program.cache.rglob('lock')).open() as lock:
+    with next(program.cache.rglob('*.double.lock')).open() as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert program.run(PATIENCE='0.2')[:4] == [42.0, 1, 1, False]
     assert program.run()[:4] == LOADED

@@ -81,6 +81,7 @@ def estimate_surface(
     uses_neighbours = uses_neighbours_in(frame, config)
     from_neighbours = Evidence(*np.zeros((2, len(candidates.r))))
     seed, odds = seeds(frame, given, config)
+    scales = log_length_scales(frame, given, config)
 
     def evidence(mean: FloatArray, std: FloatArray, theta: FloatArray) -> tuple[Any, ...]:
         prior = prior_variance(variances_of(theta)[0], config.observation, knots)
@@ -89,11 +90,14 @@ def estimate_surface(
 
     if uses_neighbours:
         few = everywhere[::STEP]
-        inliers = grow_inliers(frame, few, seed, odds, from_neighbours, config)
-        _, shown = evidence(*_regress(frame, few, inliers, given, config)[:2], given)
+        inliers = grow_inliers(frame, few, seed, odds, from_neighbours, scales[0], config)
+        _, shown = evidence(*_regress(frame, few, inliers, given, *scales, config), given)
         from_neighbours = at_candidates(shown, candidates, knots)
-    inliers = grow_inliers(frame, everywhere, seed, odds, from_neighbours, config)
-    mean, std, knot_u, u = _regress(frame, everywhere, inliers, theta, config)
+    inliers = grow_inliers(frame, everywhere, seed, odds, from_neighbours, scales[0], config)
+    if not np.array_equal(theta[2:], given[2:]):
+        scales = log_length_scales(frame, theta, config)
+    u, knot_u = scales
+    mean, std = _regress(frame, everywhere, inliers, theta, u, knot_u, config)
     if uses_neighbours:
         prior, shown = evidence(mean, std, theta)
         mean, std = combined_surface(mean, std, prior, *shown)
@@ -225,6 +229,7 @@ def grow_inliers(
     seed: BoolArray,
     odds: float,
     from_neighbours: Evidence,
+    u: FloatArray,
     config: Config,
 ) -> Grown:
     """Inliers of `segments`, which grow from seeds under the given hyper-parameters.
@@ -236,10 +241,9 @@ def grow_inliers(
     paper's outlier rejection).
 
     `seed` (C,) and `odds` are of `seeds`, `from_neighbours` (C,) is the evidence of the segments
-    beside each.
+    beside each, `u` (C,) are log length-scales.
     """
     candidates, given = frame.candidates, given_theta(config)
-    u, _ = log_length_scales(frame, given, config)
     z = candidates.z - frame.prior_mean
     sill, gate_noise = _variances(frame, given, config)
     odds = odds if config.label.rule == 'roughness' else 0.0
@@ -402,15 +406,20 @@ def _condition(
 
 
 def _regress(
-    frame: Frame, segments: IntArray, inliers: Grown, theta: FloatArray, config: Config
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    frame: Frame,
+    segments: IntArray,
+    inliers: Grown,
+    theta: FloatArray,
+    u: FloatArray,
+    knot_u: FloatArray,
+    config: Config,
+) -> tuple[FloatArray, FloatArray]:
     """Surface of `segments` by themselves, by their inliers and `theta`.
 
-    Returns height about the prior mean and standard deviation at the knots, (M, K) [m], NaN where
-    there is none, and log length-scales at the knots, (M, K), and the candidates, (C,) [log m].
+    `u` (C,) and `knot_u` (M, K) are log length-scales at the candidates and knots. Returns height
+    about the prior mean and standard deviation at the knots, (M, K) [m], NaN where there is none.
     """
     candidates, which = frame.candidates, np.flatnonzero(inliers.inlier)
-    u, knot_u = log_length_scales(frame, theta, config)
     mean, std = np.full((2, *knot_u.shape), np.nan)
     sill, noise = _variances(frame, theta, config)
     line = line_variances(config.observation)
@@ -438,4 +447,4 @@ def _regress(
         variance = variance - np.einsum('sij,sij->sj', rows, rows)
         mean[own, :n_knots] = np.where(is_wanted, height, np.nan)
         std[own, :n_knots] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
-    return mean, std, knot_u, u
+    return mean, std

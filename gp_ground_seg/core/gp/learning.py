@@ -130,8 +130,8 @@ def learn_frame(frame: Frame, config: Config) -> Learned:
     everywhere, outcome = np.arange(thin.candidates.n_segments), np.empty(2)
     seed, odds = seeds(thin, theta, config)
     nothing = Evidence(*np.zeros((2, len(seed))))
-    grown = grow_inliers(thin, everywhere, seed, odds, nothing, config)
     u, _ = log_length_scales(thin, theta, config)
+    grown = grow_inliers(thin, everywhere, seed, odds, nothing, u, config)
     inliers = take_inliers(thin, grown.inlier, u, has_latent)
     is_map, most = learning.objective == 'map', learning.max_evaluations
     n = maximise(space, inliers, config.observation, is_map, most, theta, outcome)

@@ -284,14 +284,19 @@ def find_onward(candidates: Candidates, growth: GrowthConfig, onward: FloatArray
     """
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     for m in range(len(offsets) - 1):
+        # `far` is the first that is far enough, `step` the one behind the last without a step.
+        far = step = offsets[m]
         for c in range(offsets[m], offsets[m + 1]):
             onward[c] = -math.inf
-            for j in range(c + 1, offsets[m + 1]):
-                if not is_walkable(z[j] - z[j - 1], r[j] - r[j - 1], growth.max_slope):
-                    break
-                if j > c + 1 and r[j] - r[c] >= growth.min_rise_extent:
-                    onward[c] = (z[j] - z[c] + growth.max_slope * UNEVEN) / (r[j] - r[c])
-                    break
+            far, step = max(far, c + 2), max(step, c + 1)
+            while far < offsets[m + 1] and r[far] - r[c] < growth.min_rise_extent:
+                far += 1
+            while step <= far < offsets[m + 1] and is_walkable(
+                z[step] - z[step - 1], r[step] - r[step - 1], growth.max_slope
+            ):
+                step += 1
+            if far < step:
+                onward[c] = (z[far] - z[c] + growth.max_slope * UNEVEN) / (r[far] - r[c])
 
 
 @shared
