@@ -139,23 +139,27 @@ def jit(
     return decorate
 
 
+_PRIVATE = (
+    '_library_class', '_optimize_final_module', '_finalize_final_module',
+    'get_pointer_to_function', 'codegen',
+)  # fmt: skip
+"""Names of numba that `_entry_compiler` needs, looked up in 0.60 and 0.68."""
+
+
 @functools.cache
 def _entry_compiler() -> Any:
     """Return the compiler of numba, but what an entry calls is machine code in the entry alone.
 
     It would be optimised and made machine code by itself too, and again in each of its callers.
-    numba has no public hook here; a numba without these names takes longer.
+    numba has no public hook here: one without these names compiles as it does by itself.
     """
-    from numba.core.codegen import JITCodeLibrary
+    from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
     from numba.core.compiler import Compiler
 
-    class Part(JITCodeLibrary):  # type: ignore[misc]
-        def _optimize_functions(self, ll_module: Any) -> None:
-            ll_module.data_layout = self._codegen._data_layout
-            passes, builder = self._codegen._function_pass_manager(opt=1)
-            for function in ll_module.functions:
-                passes.run(function, builder)
+    if not {*_PRIVATE} <= {*dir(JITCodeLibrary), *dir(JITCPUCodegen)}:
+        return Compiler
 
+    class Part(JITCodeLibrary):  # type: ignore[misc]
         def _optimize_final_module(self) -> None:
             pass
 
