@@ -9,11 +9,7 @@ from hypothesis import strategies as st
 from gp_ground_seg.core.compiled import ground_plane as compiled
 from gp_ground_seg.core.frame import Candidates
 from gp_ground_seg.core.pipeline import ground_plane
-from gp_ground_seg.core.pipeline.ground_plane import (
-    MIN_CELLS,
-    N_SECTORS,
-    solve_plane,
-)
+from gp_ground_seg.core.pipeline.ground_plane import MIN_CELLS, N_SECTORS, solve_plane
 
 
 def random_candidates(seed, n_segments, n_bins, share):
