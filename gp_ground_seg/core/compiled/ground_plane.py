@@ -8,39 +8,50 @@ from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray
 from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import (
+    CLEARLY_OFF,
+    LEAST_REACH,
     MAX_Z,
     MIN_CELLS,
     N_CELLS,
     N_RINGS,
     N_SECTORS,
     N_TOGETHER,
+    REFUTATION,
+    RESOLUTION,
     RING_EDGES,
     GroundPlane,
+    Loops,
     LowestPoints,
     Moments,
     Plane,
+    best_of,
     cells_of,
     described,
+    distance,
     levelness,
+    nearness,
     own_level,
+    refined,
+    set_hypotheses,
     support_by,
     tolerance_at,
     tukey_weight,
 )
 
 
-@jit(entry=True)
-def _fit_cells(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
-    return own_level(cells, max_slope)
-
-
 def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     """Do what `gp_ground_seg.core.pipeline.ground_plane.fit_plane` does, to rounding."""
     indices, is_alone = np.empty((3, N_CELLS), np.int64), np.empty(N_CELLS, np.bool_)
     n = _tabulate(candidates, indices, is_alone)
+    if n < MIN_CELLS:
+        return None
     cell, chosen, lowest = indices[:, :n]
     cells = cells_of(candidates, cell, chosen, lowest, is_alone[:n])
-    return described(cells, *_fit_cells(cells, max_slope)) if n >= MIN_CELLS else None
+    return described(cells, *own_level(cells, max_slope, _LOOPS))
+
+
+_entry = jit(entry=True)
+_LOOPS = Loops(_entry(set_hypotheses), _entry(best_of), _entry(refined))
 
 
 @jit(entry=True)
@@ -105,6 +116,31 @@ def _support_of(plane: Plane, cells: LowestPoints) -> float:
     for c in range(len(x)):
         total += support_by(x[c], y[c], z[c], inverse[c], weight[c], plane)
     return total
+
+
+@compiled_form(ground_plane.refutation_of)
+def refutation_of(plane: Plane, cells: LowestPoints) -> float:
+    """Weight of the rays that cross a plane where it should have stopped them."""
+    x, y, z, r = cells.x, cells.y, cells.z, cells.r
+    is_seen, reach = np.zeros(N_CELLS, dtype=np.bool_), np.full(N_SECTORS, LEAST_REACH)
+    for c in range(len(x)):
+        if abs(distance(x[c], y[c], z[c], plane) * cells.inverse[c]) < 1.0:
+            is_seen[cells.cell[c]] = True
+            # The farthest is the last of a sector.
+            reach[cells.cell[c] // N_RINGS] = max(r[c], LEAST_REACH)
+    refutation = 0.0
+    for c in range(len(x)):
+        height, crossing = distance(x[c], y[c], z[c], plane), r[c]
+        if height * cells.inverse[c] < -CLEARLY_OFF and not cells.is_alone[c]:
+            # A ray below the plane all the way, as that of a ceiling, is taken to cross it where
+            # it ends.
+            if plane[0] > 0.0:
+                crossing *= plane[0] / (plane[0] - height)
+            sector = cells.cell[c] // N_RINGS
+            ring = np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
+            if crossing < reach[sector] and not is_seen[sector * N_RINGS + ring]:
+                refutation += np.floor(REFUTATION * RESOLUTION * nearness(crossing))
+    return refutation
 
 
 @compiled_form(ground_plane.weighted_moments, fastmath=True)

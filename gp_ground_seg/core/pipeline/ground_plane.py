@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,17 +52,17 @@ APART = 0.3
 OTHER_SHARE = 0.05
 """Score of another level, by points off the best one, over that of the best one from which it
 counts: little is seen of a path between platforms, or of the top of a dock."""
-CLEAN, TIGHT = 0.4, 0.9
-"""Share of the support in all evidence, and support over the weights of all points within the
-tolerance, from which another level may be the own one: desks and cars are of many heights."""
+TIGHT = 0.8
+"""Support of another level over the weights of all points within the tolerance, from which it may
+be the own one: desks and cars are of many heights."""
 OWN = 0.3
 """`asideness` of another level, over that of the best one, below which it is the own one: 0.00 to
 0.27 on paths and docks."""
 STRAY = 0.05
 """Share of the points of a level that may lie farther in a direction than it reaches."""
-LEVEL_SHARE, STRAIGHT = 0.8, 0.1
-"""Score of the best level plane, over that of one that is tilted by less than `STRAIGHT` [rad],
-from which the tilt explains nothing: shelves on one side and floor on the other."""
+LEVEL, STRAIGHT = 1.15, 0.1
+"""Support of a level plane, by that of a tilted one with as many points: where a level one does as
+well, the tilt explains nothing. Tilt up to which levels are level [rad]: shelves on one side."""
 
 Plane = tuple[float, float, float]
 """Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
@@ -98,9 +99,8 @@ class LowestPoints(NamedTuple):
     is_alone: BoolArray  # (C,) whether there are not `N_TOGETHER`, as where noise is the lowest
 
 
-AZIMUTHS = (np.arange(N_SECTORS) + 0.5) * (2.0 * np.pi / N_SECTORS)
-DIRECTIONS = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
-"""Cosine and sine of each sector, (N_SECTORS, 2)."""
+AZIMUTHS = np.arange(0.5, 60.0) * (2.0 * np.pi / 60)
+"""Normals of the sides of a convex hull: a path that is seen far has narrow hulls."""
 
 
 def lowest_points(candidates: Candidates) -> LowestPoints:
@@ -181,7 +181,7 @@ class GroundPlane(NamedTuple):
 
     def below(self, x: FloatArray | float, y: FloatArray | float, z: FloatArray | float) -> Any:
         """How far below points it is, along z [m]."""
-        return z - (self.slope_x * x + self.slope_y * y - self.height)
+        return distance(x, y, z, self[:3])
 
     @property
     def normal(self) -> FloatArray:
@@ -204,7 +204,10 @@ def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     steepest plane to look for, as rise per metre.
     """
     cells = lowest_points(candidates)
-    return described(cells, *own_level(cells, max_slope)) if len(cells.z) >= MIN_CELLS else None
+    if len(cells.z) < MIN_CELLS:
+        return None
+    loops = Loops(set_hypotheses, best_of, refined)
+    return described(cells, *own_level(cells, max_slope, loops))
 
 
 STEPS = 1.2207440846057596 ** -np.arange(1.0, 4.0)
@@ -213,59 +216,48 @@ SPREAD = (0.5 + np.arange(1, N_TRIPLES + 1)[:, None] * STEPS) % 1.0
 the recurrence R3, whose steps are powers of the root of x^4 = x + 1 (Roberts, 2018)."""
 
 
-@shared
-def own_level(cells: LowestPoints, max_slope: float) -> tuple[Plane, float]:
+class Loops(NamedTuple):
+    """Loops over the points: those below, or compiled."""
+
+    set_hypotheses: Callable[[LowestPoints, float, FloatArray], int]
+    best_of: Callable[[FloatArray, LowestPoints, float], tuple[Plane, float, float]]
+    refined: Callable[[LowestPoints, Plane, float], Plane]
+
+
+def own_level(cells: LowestPoints, max_slope: float, loops: Loops) -> tuple[Plane, float]:
     """Plane of the level that the robot stands on, and height of another level or infinity.
 
     It is the plane with the best score, or a parallel one that is not refuted and goes on to where
-    the robot stands, as the best one does not.
+    the robot stands, as the best one does not. It is refined by the points that are nearer to it
+    than to the other.
     """
-    best, best_score = best_level(hypotheses(cells, max_slope), cells)
-    best = refined(cells, best, max_slope)
+    planes = np.empty((N_LEVEL + N_TRIPLES, 3))
+    planes = planes[: loops.set_hypotheses(cells, max_slope, planes)]
+    best, best_score, _ = loops.best_of(planes, cells, 0.0)
     # Points of the best plane, and those that lie alone, are of no other level.
-    is_left = np.abs(distance(cells.x, cells.y, cells.z, best) * cells.inverse) > 1.0
-    left = chosen(cells, is_left & ~cells.is_alone)
-    others = other_levels(best, left)
-    least = OTHER_SHARE * best_score
-    other, score, support = best_of(others, supports_of(others, left), cells, least)
+    d = np.abs(distance(cells.x, cells.y, cells.z, best))
+    is_left = (d * cells.inverse > 1.0) & ~cells.is_alone
+    left = cells._replace(weight=np.where(is_left, cells.weight, 0.0))
+    others = other_levels(best, cells, is_left)
+    other, score, support = loops.best_of(others, left, OTHER_SHARE * best_score)
     if score == 0.0:
-        return best, math.inf
-    is_on = np.abs(distance(left.x, left.y, left.z, other) * left.inverse) <= 1.0
-    may_be_own = support > TIGHT * RESOLUTION * left.weight[is_on].sum()
-    may_be_own = may_be_own and score > CLEAN * support
-    if may_be_own and asideness(cells, other, best) < OWN * asideness(cells, best, other):
-        return refined(left, other, max_slope), best[0]
-    return best, other[0]
+        return loops.refined(cells, best, max_slope), math.inf
+    from_other = np.abs(distance(cells.x, cells.y, cells.z, other))
+    whole = left.weight[from_other * cells.inverse <= 1.0].sum()
+    if support > TIGHT * RESOLUTION * whole:
+        aside, other_aside = asideness(cells, best, other), asideness(cells, other, best)
+        if other_aside < OWN * aside:
+            best, other, d, from_other = other, best, from_other, d
+    nearer = cells._replace(inverse=np.where(d <= from_other, cells.inverse, 0.0))
+    return loops.refined(nearer, best, max_slope), other[0]
 
 
 @shared
-def best_level(planes: FloatArray, cells: LowestPoints) -> tuple[Plane, float]:
-    """Plane with the best score, and its score: a level one if the tilt explains nothing."""
-    supports = supports_of(planes, cells)
-    best, score, _ = best_of(planes, supports, cells, 0.0)
-    if 0.0 < math.hypot(best[1], best[2]) < STRAIGHT:
-        levels = np.where((planes[:, 1] == 0.0) & (planes[:, 2] == 0.0), supports, 0.0)
-        level, level_score, _ = best_of(planes, levels, cells, LEVEL_SHARE * score)
-        if level_score > 0.0:
-            return level, level_score
-    return best, score
-
-
-@shared
-def chosen(cells: LowestPoints, mask: BoolArray) -> LowestPoints:
-    """Those of the points that are in a mask (C,)."""
-    x, y, z, r, inverse, weight, cell, lowest_z, is_alone = cells
-    columns = x[mask], y[mask], z[mask], r[mask], inverse[mask], weight[mask]
-    return LowestPoints(*columns, cell[mask], lowest_z[mask], is_alone[mask])
-
-
-@shared
-def hypotheses(cells: LowestPoints, max_slope: float) -> FloatArray:
-    """Level planes through some of the points, and planes through three, (P, 3)."""
+def set_hypotheses(cells: LowestPoints, max_slope: float, planes: FloatArray) -> int:
+    """Set planes through three of the points, and level ones through one; return their number."""
     n, n_planes = len(cells.z), 0
     n_level = min(n, N_LEVEL)
-    planes = np.empty((n_level + len(SPREAD), 3))
-    for t in range(len(planes)):
+    for t in range(n_level + len(SPREAD)):
         if t < n_level:
             plane = (-cells.z[t * n // n_level], 0.0, 0.0)
         else:
@@ -274,24 +266,20 @@ def hypotheses(cells: LowestPoints, max_slope: float) -> FloatArray:
         if is_possible(plane, max_slope):
             planes[n_planes, 0], planes[n_planes, 1], planes[n_planes, 2] = plane
             n_planes += 1
-    return planes[:n_planes]
+    return n_planes
 
 
-@shared
-def other_levels(best: Plane, left: LowestPoints) -> FloatArray:
+def other_levels(best: Plane, cells: LowestPoints, is_left: BoolArray) -> FloatArray:
     """Planes through some of the points, clearly over or below the best one, (P, 3).
 
     They are parallel to it, or level if its tilt may come from lying on several levels.
     """
-    is_level = math.hypot(best[1], best[2]) < STRAIGHT
-    slope_x, slope_y = (0.0, 0.0) if is_level else (best[1], best[2])
-    step = 1 + len(left.z) // N_LEVEL
-    height = -distance(left.x, left.y, left.z, (0.0, slope_x, slope_y))[::step]
+    tilt = (0.0, 0.0) if math.hypot(best[1], best[2]) < STRAIGHT else best[1:]
+    height = -distance(cells.x, cells.y, cells.z, (0.0, *tilt))[is_left]
+    height = height[:: 1 + len(height) // N_LEVEL]
     may_be = (np.abs(height - best[0]) > APART) & (height > min(best[0], 0.0))
     height = height[may_be & (height <= MAX_HEIGHT)]
-    planes = np.empty((len(height), 3))
-    planes[:, 0], planes[:, 1], planes[:, 2] = height, slope_x, slope_y
-    return planes
+    return np.column_stack([height, np.full((len(height), 2), tilt)])
 
 
 @shared
@@ -314,7 +302,6 @@ def is_possible(plane: Plane, max_slope: float) -> bool:
     return MIN_HEIGHT <= height <= MAX_HEIGHT and not steep
 
 
-@shared
 def asideness(cells: LowestPoints, own: Plane, other: Plane) -> float:
     """How little a level goes on to where the robot stands: 0 to 2.
 
@@ -326,30 +313,27 @@ def asideness(cells: LowestPoints, own: Plane, other: Plane) -> float:
     d = np.abs(distance(x, y, z, own) * inverse)
     from_other = np.abs(distance(x, y, z, other) * inverse)
     is_own, is_other = (d <= 1.0) & (d <= from_other), (from_other <= 1.0) & (from_other < d)
-    last = len(x) - 1 - int(STRAY * is_own.sum())
-    last_other = len(x) - 1 - int(STRAY * is_other.sum())
-    weight, depth, other_depth = np.where(is_other, cells.weight, 0.0), math.inf, math.inf
-    whole = weight.sum()
-    for cosine, sine in DIRECTIONS:
-        along = cosine * x + sine * y
-        reach = ranked(np.where(is_own, along, -math.inf), last)
-        reach_other = ranked(np.where(is_other, along, -math.inf), last_other)
-        depth, other_depth = min(depth, reach), min(other_depth, reach_other)
-        weight[along > max(reach, 0.0)] = 0.0
-    return float(weight.sum() / max(whole, 1.0)) + (depth < min(other_depth, 0.0))
+    if not (is_own.any() and is_other.any()):
+        return 1.0
+    along = np.multiply.outer(np.cos(AZIMUTHS), x) + np.multiply.outer(np.sin(AZIMUTHS), y)
+    reach, reach_other = (
+        np.quantile(along[:, mask], 1.0 - STRAY, axis=1, method='higher')
+        for mask in (is_own, is_other)
+    )
+    is_between = (along[:, is_other] <= np.maximum(reach, 0.0)[:, None]).all(axis=0)
+    weight = cells.weight[is_other]
+    is_outside = reach.min() < min(reach_other.min(), 0.0)
+    return float(weight[is_between].sum() / max(weight.sum(), 1.0) + is_outside)
 
 
-@shared
-def best_of(
-    planes: FloatArray, supports: FloatArray, cells: LowestPoints, least: float
-) -> tuple[Plane, float, float]:
+def best_of(planes: FloatArray, cells: LowestPoints, least: float) -> tuple[Plane, float, float]:
     """Plane with the best score above `least`, its score, and its support: NaN, 0, 0 without one.
 
     The score is the support, times the share of it in all evidence. It is at most the support, so
     that few planes need their refutation.
     """
     best, best_score, best_support = (math.nan, math.nan, math.nan), 0.0, 0.0
-    left = supports.copy()
+    left = supports_of(planes, cells)
     while len(left) > 0:
         p = np.argmax(left)
         support = left[p]
@@ -376,7 +360,7 @@ def supports_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
 def levelness(slope_x: Values, slope_y: Values) -> Values:
     """Fourth power of the cosine of a plane's tilt: a hillside is not better than the valley."""
     square = 1.0 / (1.0 + slope_x * slope_x + slope_y * slope_y)
-    return square * square
+    return choose(square == 1.0, LEVEL, square * square)
 
 
 @shared
@@ -390,13 +374,14 @@ def distance(x: Values, y: Values, z: Values, plane: Plane) -> Values:
 def support_by(
     x: Values, y: Values, z: Values, inverse: Values, weight: Values, plane: Plane
 ) -> Values:
-    """Support of a plane by a point; a whole number, so that sums are exact in any order."""
-    d = distance(x, y, z, plane) * inverse
-    support = RESOLUTION * weight * (1.0 - d * d)
-    return np.floor(choose(support > 0.0, support, 0.0))
+    """Support of a plane by a point; a whole number, so that sums are exact in any order.
+
+    It is convex in the distance: no plane between two levels has more than both of these.
+    """
+    near = 1.0 - np.abs(distance(x, y, z, plane) * inverse)
+    return np.floor(choose(near > 0.0, RESOLUTION * weight * near * near, 0.0))
 
 
-@shared
 def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     """Weight of the rays that cross a plane where it should have stopped them; a whole number.
 
@@ -421,7 +406,6 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     return float(np.floor(REFUTATION * RESOLUTION * nearness(crossing[counts])).sum())
 
 
-@shared
 def refined(cells: LowestPoints, first: Plane, max_slope: float) -> Plane:
     """Weighted least squares with Tukey's weights of the plane before, again and again.
 
@@ -489,8 +473,8 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundP
     most = max(n, int(np.count_nonzero(np.abs(other * inverse) <= 1.0)))
     d, z, r = d[is_on], z[is_on], cells.r[is_on]
     few, many, near = n // 10, 9 * n // 10, d[r < NEAR]
-    drop = np.arctan2(-z, r)
-    lift = ranked(near, len(near) // 2) if len(near) >= ENOUGH_NEAR else 0.0
+    drop = np.sort(np.arctan2(-z, r))
+    lift = float(np.sort(near)[len(near) // 2]) if len(near) >= ENOUGH_NEAR else 0.0
     return GroundPlane(
         height=height,
         slope_x=plane[1],
@@ -498,9 +482,9 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundP
         near_height=height - lift,
         support=most / len(cells.z),
         coverage=np.count_nonzero(is_new(sector[is_on])) / N_SECTORS,
-        reach=ranked(r, many),
-        depression=ranked(np.arctan2(height - d, r), many),
-        spread=ranked(drop, many) - ranked(drop, few),
+        reach=float(np.sort(r)[many]),
+        depression=float(np.sort(np.arctan2(height - d, r))[many]),
+        spread=float(drop[many] - drop[few]),
         overhung=np.count_nonzero(is_over) / np.count_nonzero(is_first),
         n_support=n,
         other_height=other_height,
@@ -512,9 +496,3 @@ def is_new(sector: IntArray) -> BoolArray:
     result = np.ones(len(sector), dtype=np.bool_)
     result[1:] = sector[1:] != sector[:-1]
     return result
-
-
-@shared
-def ranked(values: Values, rank: int) -> float:
-    """Value at `rank` in sorted order."""
-    return float(np.partition(values, rank)[rank])

@@ -152,7 +152,7 @@ def is_ceiling(plane: GroundPlane, scan: Scan) -> bool:
 
 def is_doubtful(below: View | None) -> bool:
     """Whether the plane below z is so poor, or so far away, that z may not be up."""
-    if below is None or below.is_steep or not below.is_well_supported:
+    if below is None or below.is_steep or not (below.is_well_supported or below.is_whole):
         return True
     return below.plane.height > TALL and below.plane.support < GOOD_SUPPORT
 
