@@ -75,10 +75,10 @@ def make_backend(runtime: RuntimeConfig) -> Backend:
     return NumbaBackend()
 
 
-def make_later_backend() -> Backend:
-    """Return a backend whose stages between grid and learning are numpy's, not to be compiled."""
+def partly_compiled(*stages: str) -> Backend:
+    """Backend of compiled stages, but for some, which are numpy's: these are not compiled."""
     backend = make_backend(RuntimeConfig())
-    for stage in ('fit_plane', 'find_faces', 'find_relief', 'extract_lines'):
+    for stage in stages:
         setattr(backend, stage, getattr(NumpyBackend, stage))
     return backend
 

@@ -139,72 +139,23 @@ def jit(
     return decorate
 
 
-_PRIVATE = (
-    '_library_class', '_optimize_final_module', '_finalize_final_module',
-    'get_pointer_to_function', 'codegen',
-)  # fmt: skip
-"""Names of numba that `_entry_compiler` needs, looked up in 0.60 and 0.68."""
-
-
-@functools.cache
-def _entry_compiler() -> Any:
-    """Return the compiler of numba, but what an entry calls is machine code in the entry alone.
-
-    It would be optimised and made machine code by itself too, and again in each of its callers.
-    numba has no public hook here: one without these names compiles as it does by itself.
-    """
-    from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
-    from numba.core.compiler import Compiler
-
-    if not {*_PRIVATE} <= {*dir(JITCodeLibrary), *dir(JITCPUCodegen)}:
-        return Compiler
-
-    class Part(JITCodeLibrary):  # type: ignore[misc]
-        def _optimize_final_module(self) -> None:
-            pass
-
-        def _finalize_final_module(self) -> None:
-            self._finalized = True
-
-        def get_pointer_to_function(self, name: str) -> int:
-            return 0
-
-        # The environment is set in machine code, which there is none of.
-        codegen = property(lambda self: self)
-        set_env = lambda *_: None  # noqa: E731
-
-    class EntryCompiler(Compiler):  # type: ignore[misc]
-        def compile_extra(self, func: Callable[..., Any]) -> Any:
-            codegen = self.state.targetctx.codegen()
-            self.state.library = codegen.create_library(func.__qualname__)
-            self.state.library.enable_object_caching()
-            codegen._library_class = Part
-            try:
-                return super().compile_extra(func)
-            finally:
-                del codegen._library_class
-
-    return EntryCompiler
-
-
 def _njit_kept(function: Callable[..., Any]) -> Any:
     """Compile `function` with its code kept on disk, if there is a folder to trust for it."""
     import numba
 
-    options = _options() | {'pipeline_class': _entry_compiler()}
     folder = code_folder()
     if folder is None:
-        return numba.njit(**options)(function)
+        return numba.njit(**_options())(function)
     # numba reads this once, here. Without it, code would lie beside our sources.
     before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
     try:
-        kept = numba.njit(**options, cache=True)(function)
+        kept = numba.njit(**_options(), cache=True)(function)
     finally:
         numba.config.CACHE_DIR = before
     place = Path(kept.stats.cache_path)
     if folder not in place.parents:
         _log_not_kept(f'{folder} cannot be written to')
-        return numba.njit(**options)(function)
+        return numba.njit(**_options())(function)
     # numba has no public hook here; a numba without these names keeps code without checksums.
     cache: Any = getattr(kept, '_cache', None)
     module = Path(function.__code__.co_filename).stem

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 
 from gp_ground_seg.core import jit, segmenter
-from gp_ground_seg.core.backend import Backend
+from gp_ground_seg.core.backend import Backend, partly_compiled
 from gp_ground_seg.core.parameters.config import Config
 
 FOLLOWS = (
@@ -25,10 +25,13 @@ JOIN_TIMEOUT = 0.5  # longest wait for the thread [s]
 # tenth of the time.
 _POLITELY = 'import gc; gc.set_threshold(50_000); os.nice(1); '
 _COMPILE = _POLITELY + 'from gp_ground_seg.ros.loader import compile_all; compile_all()'
-_COMPILE_LATER = _POLITELY + (
-    'from gp_ground_seg.core import backend, segmenter; '
-    'segmenter.warm_up(backend=backend.make_later_backend())'
+_COMPILE_PROCESSES = _POLITELY + (
+    'from gp_ground_seg.ros.loader import compile_but, OTHERS; compile_but(*OTHERS)'
 )
+PROCESSES = 'learn_frame', 'estimate_surface'
+OTHERS = 'fit_plane', 'find_faces', 'find_relief', 'extract_lines', 'label_points'
+"""Stages of a frame after the grid, of which the first take as long to compile as the others. They
+share the growth of inliers, which one process compiles once."""
 _CHILD = """\
 import os, signal, sys, threading
 sys.path[:] = {path!r}
@@ -50,14 +53,18 @@ def child_command(code: str) -> list[str]:
 
 
 def compile_all() -> None:
-    """Compile all code that a frame needs; where there are two cores, in two processes."""
+    """Compile all code that a frame needs; where there are two cores, with a child process."""
     if len(os.sched_getaffinity(0)) > 1 and jit.has_to_compile():
         # Where it fails, this process compiles that too.
-        command, pipe, nowhere = child_command(_COMPILE_LATER), subprocess.PIPE, subprocess.DEVNULL
-        with subprocess.Popen(command, cwd='/', stdin=pipe, stderr=nowhere):
-            segmenter.warm_up()
-    else:
-        segmenter.warm_up()
+        command, pipe = child_command(_COMPILE_PROCESSES), subprocess.PIPE
+        with subprocess.Popen(command, cwd='/', stdin=pipe, stderr=subprocess.DEVNULL):
+            compile_but(*PROCESSES)
+    segmenter.warm_up()
+
+
+def compile_but(*stages: str) -> None:
+    """Compile the code of a frame but for some stages."""
+    segmenter.warm_up(backend=partly_compiled(*stages))
 
 
 class BackendLoader(threading.Thread):
