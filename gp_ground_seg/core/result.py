@@ -133,7 +133,7 @@ class Segmentation:
     #: height and tilt of the sensor that were used, and what the scan says of them;
     #: ``pose.level(xyz)`` gives points in the level frame
     pose: SensorPose
-    relief: Relief  #: height of the land in plan, over which those of `frame` and `surface` are
+    relief: Relief  #: height of the terrain in plan, over which those of `frame` and `surface` are
     z: PointArray  #: (N,) height of each point in the sensor frame [m]
     config: Config  #: parameters of the frame (those given, with narrower gates for a low sensor)
 

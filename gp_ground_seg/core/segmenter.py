@@ -167,8 +167,8 @@ class GroundSegmenter:
         # 3. Vertical faces: walls, fences, sides of cars.
         faces = backend.find_faces(scan, height, config)
         timer.mark('faces')
-        # 4. Relief of the land. Lines along each segment, over it, without lowest points of faces
-        #    with occluded base, and pseudo-inputs. The prior mean is the ground below the sensor.
+        # 4. Relief of the terrain; lines along each segment, over it, without lowest points of
+        #    faces with occluded base; pseudo-inputs. The prior mean is the ground near the sensor.
         relief, candidates = backend.find_relief(scan.candidates, faces, height, config)
         candidates, lines, pseudo, onward, in_face = backend.extract_lines(
             candidates, faces, config

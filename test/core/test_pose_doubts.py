@@ -195,7 +195,7 @@ def level_above(name, sensor, height):
 @SENSORS
 @pytest.mark.parametrize('name', LEVELS)
 def test_the_robot_stands_on_the_level_near_it(sensor, name):
-    """Land beside it, lower or higher, of which more is seen, is not the ground near it."""
+    """Terrain beside it, lower or higher, of which more is seen, is not the ground near it."""
     height = (0.8 if sensor is SMALL_VLP else 1.75) + 0.7 * (LEVELS[name][-1][1] > 0.0)
     points = level_above(name, sensor, height)
     pose = pose_of(points)
@@ -211,7 +211,7 @@ def test_the_robot_stands_on_the_level_near_it(sensor, name):
 
 
 def test_a_given_level_that_is_seen_as_well_is_not_contradicted():
-    """The land on both sides of the dike: which level is meant, the scan does not tell."""
+    """The terrain on both sides of the dike: which level is meant, the scan does not tell."""
     points = level_above('dike', SMALL_HDL, 1.75)
     assert pose_of(points, height=1.75 + 1.5).contradictions == ()
     assert len(pose_of(points, height=1.75 + 0.75).contradictions) == 1

@@ -1,4 +1,4 @@
-"""The relief of the land: both backends, and what it does and does not follow."""
+"""The relief of the terrain: both backends, and what it does and does not follow."""
 
 import math
 
@@ -52,7 +52,7 @@ def test_backends_find_one_relief(compiled_code, seed, n_segments, looks_aside):
     steep, foot, turn, noise = rng.uniform((0.1, 5.0, -3.0, 0.0), (0.8, 15.0, 3.0, 0.1))
     fall, fall_at = rng.uniform((0.0, 4.0), (4.0, 12.0))
 
-    def land(x, y):
+    def terrain(x, y):
         along = x * math.cos(turn) + y * math.sin(turn)
         bank = np.clip(steep * (along - foot), 0.0, 3.0)
         thing = 1.5 * (rng.uniform(size=len(x)) < 0.05)
@@ -60,7 +60,7 @@ def test_backends_find_one_relief(compiled_code, seed, n_segments, looks_aside):
         return bank + below + thing + noise * rng.normal(size=len(x))
 
     ranges = np.sort(rng.uniform(2.0, 65.0, 24))
-    candidates = candidates_on(land, ranges, n_segments, seed, share=0.7)
+    candidates = candidates_on(terrain, ranges, n_segments, seed, share=0.7)
     faces = Faces(*(rng.uniform(size=(2, N_TILES)) < 0.1))
     config = Config().replace(**{'surface.look_aside': looks_aside})
     found = [backend.find_relief(candidates, faces, HEIGHT, config) for backend in BACKENDS]
@@ -73,7 +73,7 @@ def test_backends_find_one_relief(compiled_code, seed, n_segments, looks_aside):
 
 
 def bank(degrees, foot, high=3.0):
-    """Land that rises from x = `foot` [m] on."""
+    """Terrain that rises from x = `foot` [m] on."""
     return lambda x, y: np.clip(math.tan(math.radians(degrees)) * (x - foot), 0.0, high)
 
 
@@ -81,10 +81,10 @@ def bank(degrees, foot, high=3.0):
 def test_the_relief_is_that_of_a_bank(backend, degrees):
     side = math.copysign(1.0, degrees)
 
-    def land(x, y):
+    def terrain(x, y):
         return side * bank(abs(degrees), 10.0)(x, y)
 
-    candidates = candidates_on(land, RINGS)
+    candidates = candidates_on(terrain, RINGS)
     relief, over = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
     missed = over.z + HEIGHT
     assert np.abs(candidates.z + HEIGHT).max() == pytest.approx(3.0)
@@ -98,7 +98,7 @@ def test_the_relief_is_that_of_a_bank(backend, degrees):
 
 @pytest.mark.parametrize(('at', 'depth'), [(5.0, 1.2), (7.5, 2.0), (10.0, 3.0)])
 def test_land_ends_at_an_edge_and_goes_on_below(backend, at, depth):
-    """What the edge hides is left out: on both sides the relief is that of the land to its end."""
+    """What the edge hides is left out: the relief follows the terrain up to it, on both sides."""
     candidates = candidates_on(lambda x, y: np.where(x > at, -depth, 0.0), RINGS)
     seen = at * (HEIGHT + depth) / HEIGHT
     candidates = candidates.where((candidates.x < at) | (candidates.x > seen))
@@ -112,10 +112,10 @@ def test_land_ends_at_an_edge_and_goes_on_below(backend, at, depth):
 def box(x0, x1, y0, y1, high):
     """Level ground with a box on it."""
 
-    def land(x, y):
+    def terrain(x, y):
         return high * ((x > x0) & (x < x1) & (y > y0) & (y < y1))
 
-    return land
+    return terrain
 
 
 LEVEL_LAND = {

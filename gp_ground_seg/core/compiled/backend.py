@@ -85,7 +85,7 @@ class NumbaBackend:
     def find_relief(
         self, candidates: Candidates, faces: Faces, height: float, config: Config
     ) -> tuple[Relief, Candidates]:
-        """Relief of the land, and the candidates over it."""
+        """Relief of the terrain, and the candidates over it."""
         growth = numbers_of(config.growth)
         relief, z = Relief.level(), np.empty_like(candidates.z)
         if not config.surface.look_aside or relief_.find_relief(

@@ -69,17 +69,17 @@ def find_relief(
     Where it is, nothing is set.
     """
     before, behind = reachable(candidates, is_face, height, growth)
-    land, is_known = _fit_planes(candidates, before, height)
-    below, is_known_below = land, np.zeros(_N_SQUARES, np.bool_)
+    terrain, is_known = _fit_planes(candidates, before, height)
+    below, is_known_below = terrain, np.zeros(_N_SQUARES, np.bool_)
     if behind.any():
         below, is_known_below = _fit_planes(candidates, behind, height)
-    if max(np.abs(land).max(), np.abs(below).max()) <= FADED:
+    if max(np.abs(terrain).max(), np.abs(below).max()) <= FADED:
         return True
     is_behind = np.zeros(_N_SQUARES, np.bool_)
     if is_known_below.any():
         is_behind = _behind_of(candidates, before, is_known, behind, is_known_below)
         _set_pieces(below, is_known_below, is_behind, pieces)
-    _set_pieces(land, is_known, ~is_behind, pieces)
+    _set_pieces(terrain, is_known, ~is_behind, pieces)
     for c in range(len(z)):
         z[c] = candidates.z[c] - height_at(pieces, candidates.x[c], candidates.y[c])
     return False
@@ -87,17 +87,17 @@ def find_relief(
 
 @jit()
 def _set_pieces(
-    land: FloatArray, is_known: BoolArray, chosen: BoolArray, pieces: FloatArray
+    terrain: FloatArray, is_known: BoolArray, chosen: BoolArray, pieces: FloatArray
 ) -> None:
-    """Set the `chosen` ones of the pieces by the land, and let it be known all over."""
-    _fill(land, is_known)
+    """Set the `chosen` ones of the pieces by the terrain, and let it be known all over."""
+    _fill(terrain, is_known)
     for k in range(_N_SQUARES):
-        land[k] = faded(land[k])
+        terrain[k] = faded(terrain[k])
     for i in range(N_SIDES - 1):
         for j in range(N_SIDES - 1):
             k = _place(i, j)
             if chosen[k]:
-                corners = land[k], land[k + _WIDTH], land[k + 1], land[k + 1 + _WIDTH]
+                corners = terrain[k], terrain[k + _WIDTH], terrain[k + 1], terrain[k + 1 + _WIDTH]
                 level, along_u, along_v, twist = piece_of(*corners)
                 pieces[i, j, 0], pieces[i, j, 1] = level, along_u
                 pieces[i, j, 2], pieces[i, j, 3] = along_v, twist
@@ -111,7 +111,7 @@ def _behind_of(
     behind: BoolArray,
     is_known_below: BoolArray,
 ) -> BoolArray:
-    """Which pieces are of the land behind falls, (squares,). See the plain `_is_behind`."""
+    """Which pieces are of the terrain behind falls, (squares,). See the plain `_is_behind`."""
     share, is_seen = np.zeros(_N_SQUARES), np.zeros(_N_SQUARES, np.bool_)
     for c in range(len(before)):
         x, y = candidates.x[c], candidates.y[c]
@@ -122,7 +122,7 @@ def _behind_of(
             share[piece], is_seen[piece] = 1.0, True
         elif behind[c] and is_known_below[square]:
             is_seen[piece] = True
-    # Of those without land, all that are as near to land before falls get a share of it.
+    # Of those without terrain, all that are as near to terrain before falls get a share of it.
     _fill(share, is_seen)
     result: BoolArray = is_seen & (share == 0.0)
     return result
@@ -156,7 +156,7 @@ def _place(i: int, j: int) -> int:
 def _fit_planes(
     candidates: Candidates, reached: BoolArray, height: float
 ) -> tuple[FloatArray, BoolArray]:
-    """Heights of the land in all squares, 0 where unknown, and which are known.
+    """Heights of the terrain in all squares, 0 where unknown, and which are known.
 
     See the plain `fit_planes`.
     """
@@ -168,7 +168,7 @@ def _fit_planes(
     weight, plane = np.empty(len(x)), np.zeros((_N_SQUARES, 5))
     for c in range(len(x)):
         weight[c] = 1.0 / number[square[c]] if reached[c] else 0.0
-    land, is_known = np.zeros(_N_SQUARES), np.zeros(_N_SQUARES, np.bool_)
+    terrain, is_known = np.zeros(_N_SQUARES), np.zeros(_N_SQUARES, np.bool_)
     for _ in range(N_ROUNDS):
         sums = _sums_around(x, y, z, height, weight, square)
         for k in range(_N_SQUARES):
@@ -181,12 +181,12 @@ def _fit_planes(
     for i in range(N_SIDES):
         for j in range(N_SIDES):
             k = _place(i, j)
-            # Most squares have no land about them.
+            # Most squares have no terrain about them.
             if sums[k, 0] >= MIN_WEIGHT:
                 _set_plane(sums[k], plane[k])
                 is_known[k] = True
-                land[k] = height_of(plane[k], middle_of(i), middle_of(j))
-    return land, is_known
+                terrain[k] = height_of(plane[k], middle_of(i), middle_of(j))
+    return terrain, is_known
 
 
 @jit()
@@ -229,7 +229,7 @@ def _sums_around(
 
 
 @jit()
-def _fill(land: FloatArray, is_known: BoolArray) -> None:
+def _fill(terrain: FloatArray, is_known: BoolArray) -> None:
     """See the plain `filled`."""
     ring, following = np.empty(_N_SQUARES, np.int64), np.empty(_N_SQUARES, np.int64)
     is_waiting, mean = np.zeros(_N_SQUARES, np.bool_), np.empty(_N_SQUARES)
@@ -242,7 +242,7 @@ def _fill(land: FloatArray, is_known: BoolArray) -> None:
                 ring[n] = k
                 n += 1
             else:
-                land[k] = 0.0
+                terrain[k] = 0.0
     while n > 0:
         n_following = 0
         for q in range(n):
@@ -253,27 +253,27 @@ def _fill(land: FloatArray, is_known: BoolArray) -> None:
                         following[n_following] = k
                         n_following += 1
         for q in range(n_following):
-            mean[q] = _mean_around(land, is_known, following[q])
+            mean[q] = _mean_around(terrain, is_known, following[q])
         for q in range(n_following):
-            land[following[q]], is_known[following[q]] = mean[q], True
+            terrain[following[q]], is_known[following[q]] = mean[q], True
         ring, following, n = following, ring, n_following
 
 
 @jit()
-def _mean_around(land: FloatArray, is_known: BoolArray, k: int) -> float:
+def _mean_around(terrain: FloatArray, is_known: BoolArray, k: int) -> float:
     """Mean of the known heights in the eight squares around one."""
     number, total = 0, 0.0
     for here in range(k - 1, k + 2):
         near, far = here - _WIDTH, here + _WIDTH
         # Of one side to the other first, as in the plain `three_by_three`.
-        total += (land[near] + land[here]) + land[far]
+        total += (terrain[near] + terrain[here]) + terrain[far]
         for there in (near, here, far):
             number += is_known[there]
     mean: float = total / number
     return mean
 
 
-# Which candidates are land.
+# Which candidates are terrain.
 
 
 class _Walk(NamedTuple):
@@ -303,11 +303,11 @@ def reachable(
         _step_aside(candidates, allowed, aside, walk)
     _step_in_front(candidates, steep, walk)
     _step_in_front(candidates, down, walk)
-    is_land = allowed.copy()
-    _leave_out_not_entered(candidates, walk, is_land)
+    is_terrain = allowed.copy()
+    _leave_out_not_entered(candidates, walk, is_terrain)
     parent, n_seeds = walk.parent, np.zeros(n, np.int64)
     for c in range(n):
-        if walk.is_fallen[c] and is_land[c] and is_land[c - 1]:
+        if walk.is_fallen[c] and is_terrain[c] and is_terrain[c - 1]:
             _join(parent, c - 1, c)
         else:
             walk.is_fallen[c] = False
@@ -317,8 +317,8 @@ def reachable(
         if is_near and abs(candidates.z[c] + height) < growth.seed_height_tolerance:
             n_seeds[parent[c]] += 1
     for c in range(n):
-        is_land[c] &= n_seeds[parent[c]] >= MIN_SEEDS
-    return _sides_of(candidates, is_land, walk.is_fallen)
+        is_terrain[c] &= n_seeds[parent[c]] >= MIN_SEEDS
+    return _sides_of(candidates, is_terrain, walk.is_fallen)
 
 
 @jit()
@@ -351,7 +351,7 @@ def _step(walk: _Walk, a: int, b: int) -> None:
 
 @jit()
 def _leave_out_not_entered(candidates: Candidates, walk: _Walk, reached: BoolArray) -> None:
-    """See the plain `_entered`. A part of raised land is reached as a whole, or not at all."""
+    """See the plain `_entered`. A part of raised terrain is reached as a whole, or not at all."""
     r, n, offsets = candidates.r, len(reached), candidates.offsets
     width, last = np.zeros(n), np.zeros(n, np.int64)
     for m in range(len(offsets) - 1):

@@ -223,7 +223,7 @@ class SurfaceConfig(ParameterGroup):
 
     look_aside: bool = advanced(True, (),
         'whether neighbouring segments are evidence for the ground of a segment, and show the '
-        'relief of the land; false = each segment by itself')
+        'relief of the terrain; false = each segment by itself')
 
 
 @dataclass(frozen=True)

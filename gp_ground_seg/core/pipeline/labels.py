@@ -95,7 +95,7 @@ def label_points(
 def depth_of_ground(height: float, label: LabelConfig) -> float:
     """Depth below the surface down to which a return is ground [m].
 
-    A sensor at a `height` below 1 m sees tops of what stands on lower land behind an edge.
+    A sensor at a `height` below 1 m sees tops of what stands on lower terrain behind an edge.
     """
     by_roughness = min(height, 1.0) * label.obstacle_max_height
     return by_roughness if label.rule == 'roughness' else label.ground_tolerance

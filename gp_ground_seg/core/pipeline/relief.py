@@ -1,10 +1,10 @@
-"""Stage 4: the relief of the land, over which lines and surfaces are found.
+"""Stage 4: the relief of the terrain, over which lines and surfaces are found.
 
 The surface of a segment is a function of range with a level prior. Along one segment the foot of
 a bank is like that of a wall; in plan it is not, as a bank is wide and deep. So candidates that
 can be reached on foot from the ground near the sensor are found first, in steps along segments and
 between them. Planes through those in 3 by 3 squares, each fitted robustly, are the relief: it has
-the height of banks and hills, and fades where the land is as high as the prior mean.
+the height of banks and hills, and fades where the terrain is as high as the prior mean.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import Config
 
 REACH = 60.0
-"""Half the side of the relief, and range up to which it follows the land [m]; beyond, it has the
-height of its border."""
+"""Half the side of the relief, and range up to which it follows the terrain [m]; beyond, it is as
+high as at its border."""
 SIDE = 2.0
 """Side of a square [m]."""
 N_SIDES = round(2.0 * REACH / SIDE)
@@ -42,11 +42,11 @@ long between segments."""
 MAX_SLOPE, STEP_TOLERANCE = 0.84, 0.06
 """Steepest step, of 40 degrees, and what it may rise beyond that by roughness and noise [m]."""
 GENTLE, STEEP, MIN_WIDTH = 0.3, 0.8, 6.0
-"""Largest rise or fall of a step; that of one along a segment which is taken where others are side
-by side with it over a width, and this width: more than the length of a car [m]. In such a front a
-step may also fall by any height, see `falls`: nothing that stands on the land is below it."""
+"""Largest rise or fall of any step [m]; that of a step along a segment, if neighbouring segments
+have such a step too, over this width: more than the length of a car [m]. Such a front may also go
+down by any height, see `falls`: no object is lower than the ground that it stands on."""
 LONG_GROWTH, MIN_SLOPE, SAME_SLOPE = 0.4, 0.06, 0.08
-"""Growth with range of the longest step along a segment that goes on with the slope of the land
+"""Growth with range of the longest step along a segment that goes on with the slope of the terrain
 before it [m/m], in such a front too; least slope of one, and difference to that before."""
 N_ASIDE = 2
 """Segments on each side that a step may lead to."""
@@ -62,14 +62,15 @@ RIDGE = 0.5
 MIN_WEIGHT = 1.5
 """Least weight of a plane, where a square with candidates counts one."""
 RAISED, MIN_ENTRY = 0.3, 1.5
-"""Height over which land is raised [m]; width over which steps must lead up to it [m]: few lead to
-a car."""
+"""Height from which terrain is raised [m]; width over which steps must lead up to it [m]: few lead
+to a car."""
 FADED, FADE_WIDTH = 0.15, 0.3
-"""Height of the land up to which the relief is level, and over which it then grows to it [m]."""
+"""Height of the terrain up to which the relief is level [m]; within this much more it grows to it
+[m]."""
 
 
 class Relief(NamedTuple):
-    """Height of the land over the prior mean, in plan."""
+    """Height of the terrain over the prior mean, in plan."""
 
     # (N_SIDES - 1, N_SIDES - 1, 4) pieces between the middles of four squares, see `piece_of`
     pieces: FloatArray
@@ -81,7 +82,7 @@ class Relief(NamedTuple):
 
     @classmethod
     def level(cls) -> Relief:
-        """Relief of level land."""
+        """Relief of level terrain."""
         return cls(np.zeros((N_SIDES - 1, N_SIDES - 1, 4)))
 
     @classmethod
@@ -109,10 +110,10 @@ class Relief(NamedTuple):
 def find_relief(
     candidates: Candidates, faces: Faces, height: float, config: Config
 ) -> tuple[Relief, Candidates]:
-    """Relief of the land over a plane `height` [m] below the origin; candidates over the relief.
+    """Relief over a plane `height` [m] below the origin, and the candidates over the relief.
 
-    Vertical faces are no land. What is behind a fall has a relief of its own, so that the land
-    before it is as high up to its edge.
+    Vertical faces are no terrain. What is behind a fall has a relief of its own, so that the
+    relief before it is flat up to the edge.
     """
     if not config.surface.look_aside:
         return Relief.level(), candidates
@@ -121,26 +122,26 @@ def find_relief(
     is_seed = allowed & (candidates.r < growth.seed_range)
     is_seed &= np.abs(over_plane.z) < growth.seed_height_tolerance
     sides = [over_plane.where(side) for side in reachable(over_plane, allowed, is_seed)]
-    lands = [fit_planes(side.x, side.y, side.z) for side in sides if len(side.r)]
-    if not any((np.abs(land[is_known]) > FADED).any() for land, is_known in lands):
+    terrains = [fit_planes(side.x, side.y, side.z) for side in sides if len(side.r)]
+    if not any((np.abs(terrain[is_known]) > FADED).any() for terrain, is_known in terrains):
         return Relief.level(), candidates
-    relief = Relief.of(faded(filled(*lands[0])))
-    if len(lands) == 2 and lands[1][1].any():
-        behind = Relief.of(faded(filled(*lands[1])))
-        is_behind = _is_behind(sides, lands)[..., None]
+    relief = Relief.of(faded(filled(*terrains[0])))
+    if len(terrains) == 2 and terrains[1][1].any():
+        behind = Relief.of(faded(filled(*terrains[1])))
+        is_behind = _is_behind(sides, terrains)[..., None]
         relief = Relief(np.where(is_behind, behind.pieces, relief.pieces))
     return relief, candidates._replace(z=candidates.z - relief.at(candidates.x, candidates.y))
 
 
-def _is_behind(sides: list[Candidates], lands: list[tuple[FloatArray, BoolArray]]) -> BoolArray:
-    """Which pieces of the relief are nearer to land behind falls than to land before them.
+def _is_behind(sides: list[Candidates], terrains: list[tuple[FloatArray, BoolArray]]) -> BoolArray:
+    """Which pieces of the relief are nearer to terrain behind falls than to terrain before them.
 
-    As a mask, (N_SIDES - 1, N_SIDES - 1). Pieces with land of both are of that before.
+    As a mask, (N_SIDES - 1, N_SIDES - 1). Pieces with terrain of both are of that before.
     """
     from scipy.ndimage import distance_transform_cdt
 
     rings = np.full((2, N_SIDES - 1, N_SIDES - 1), N_SIDES, dtype=np.int32)
-    for ring, side, (_, is_known) in zip(rings, sides, lands, strict=True):
+    for ring, side, (_, is_known) in zip(rings, sides, terrains, strict=True):
         known = is_known[square_of(side.x).astype(np.int64), square_of(side.y).astype(np.int64)]
         u, v = (
             from_first_middle(place[known], np.float64).astype(np.int64)
@@ -160,12 +161,12 @@ def reachable(
     """Which of the candidates can be reached from enough seeds in steps over `allowed` ones.
 
     Gentle steps are taken in any case, steep and long ones where they form a front, side by side:
-    those to a car are few. Falls form one with steps that lead down, and lead from land only: what
-    is seen over a hedge is below its top. Heights of the candidates are over the plane near the
-    sensor.
+    those to a car are few. A front may mix falls and steps down. A fall counts from terrain only:
+    what is seen over a hedge is below its top. Heights of the candidates are over the plane near
+    the sensor.
 
     Returns those before falls in their segment, and those behind and below one, two (C,): across a
-    ditch the land is that before it.
+    ditch the terrain is that before it.
     """
     first, second, is_fall = _steps(candidates)
     taken = allowed[first] & allowed[second]
@@ -179,8 +180,8 @@ def reachable(
     for wanted in (wanting[~is_fall[wanting]], wanting[leads_down[wanting]]):
         taken[wanted] |= _in_front(candidates, first[wanted])
     is_way_up = taken & ~is_fall
-    is_land = _entered(candidates, allowed, first[is_way_up], second[is_way_up])
-    taken &= ~is_fall | (is_land[first] & is_land[second])
+    is_terrain = _entered(candidates, allowed, first[is_way_up], second[is_way_up])
+    taken &= ~is_fall | (is_terrain[first] & is_terrain[second])
     group = _groups(len(allowed), first[taken], second[taken])
     is_reached = (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
     is_fallen = np.zeros(len(allowed), dtype=np.bool_)
@@ -190,7 +191,7 @@ def reachable(
     edge = np.append(0, np.flatnonzero(is_fallen))[number] - 1
     is_behind = number > np.append(0, number)[candidates.offsets][candidates.segment]
     is_behind &= candidates.z < candidates.z[edge] - STEEP
-    return is_land & is_reached & ~is_behind, is_land & is_reached & is_behind
+    return is_terrain & is_reached & ~is_behind, is_terrain & is_reached & is_behind
 
 
 def _entered(
@@ -297,7 +298,7 @@ def largest_gap(r: Values) -> Values:
 
 @shared
 def longest_gap(r: Values) -> Values:
-    """Longest step that goes on with the slope of the land before it, at a range [m]."""
+    """Longest step that goes on with the slope of the terrain before it, at a range [m]."""
     return GAP + LONG_GROWTH * r
 
 
@@ -310,9 +311,9 @@ def goes_on(slope: Values, before: Values) -> Values:
 
 @shared
 def falls(distance: Values, rise: Values) -> Values:
-    """Whether a step leads down over an edge, by more than a steep one and than level land does.
+    """Whether a step leads down over an edge: deeper than a steep one, and than level terrain.
 
-    What the edge hides is longer than a square, so that no piece has land of both sides.
+    What the edge hides is longer than a square, so that no piece has terrain of both sides.
     """
     is_deep = (rise < -STEEP) & (rise < -MIN_SLOPE * distance)
     return is_deep & (distance > math.sqrt(2.0) * SIDE)
@@ -331,7 +332,7 @@ def can_step(distance: Values, rise: Values, most: float) -> Values:
 
 
 def fit_planes(x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Height of the land in the middle of each square, by the places (P,) in and around it.
+    """Height of the terrain in the middle of each square, by the places (P,) in and around it.
 
     The places in a square share a weight of one, so that those near the sensor are not all. Then
     each counts less with its distance to the plane of its own square.
@@ -350,9 +351,9 @@ def fit_planes(x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray,
         there = [table[i, j] for table in plane]
         weight = robust_weight(z - height_of(there, x, y)) / number
     middle = middle_of(np.arange(N_SIDES))
-    land: FloatArray = height_of(plane, middle[:, None], middle)
+    terrain: FloatArray = height_of(plane, middle[:, None], middle)
     is_known: BoolArray = around[0] >= MIN_WEIGHT
-    return land, is_known
+    return terrain, is_known
 
 
 def three_by_three(table: npt.NDArray[Any]) -> FloatArray:
@@ -364,16 +365,16 @@ def three_by_three(table: npt.NDArray[Any]) -> FloatArray:
     return result
 
 
-def filled(land: FloatArray, is_known: BoolArray) -> FloatArray:
-    """Land with each unknown height the mean of those known around it, ring by ring."""
-    land = np.where(is_known, land, 0.0)
+def filled(terrain: FloatArray, is_known: BoolArray) -> FloatArray:
+    """Terrain with each unknown height the mean of those known around it, ring by ring."""
+    terrain = np.where(is_known, terrain, 0.0)
     while is_known.any() and not is_known.all():
         number = three_by_three(is_known)
-        mean = three_by_three(land) / np.maximum(number, 1.0)
+        mean = three_by_three(terrain) / np.maximum(number, 1.0)
         is_next = ~is_known & (number > 0.0)
-        land[is_next] = mean[is_next]
+        terrain[is_next] = mean[is_next]
         is_known = is_known | is_next
-    return land
+    return terrain
 
 
 @shared
@@ -450,8 +451,8 @@ def robust_weight(residual: Values) -> Values:
 
 
 @shared
-def faded(land: Values) -> Values:
-    """Height of the relief where the land is so high [m]: level where it is low."""
-    share = (np.abs(land) - FADED) / FADE_WIDTH
+def faded(terrain: Values) -> Values:
+    """Height of the relief where the terrain is so high [m]: level where it is low."""
+    share = (np.abs(terrain) - FADED) / FADE_WIDTH
     share = np.minimum(np.maximum(share, 0.0), 1.0)
-    return land * share * share * (3.0 - 2.0 * share)
+    return terrain * share * share * (3.0 - 2.0 * share)

@@ -5,8 +5,8 @@ returns above the base can: together they form a vertical surface. The base of a
 occluded where something stands before it, or where the rings of the sensor miss the strip of
 ground in its tile; the lowest return of the tile then belongs to the face.
 
-Land is smooth: the returns of a tile lie on a plane. Those of a bush or of stairs do not. Raised
-tiles among which many scatter, more than the own level does, show no ground either.
+Terrain is smooth: the returns of a tile lie on a plane. Those of a bush or of stairs do not.
+Raised tiles are no ground either where many around them scatter more than the own level does.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ between them [m, m^2]."""
 SCATTERED = Window(2, 0.75, 4)
 """Window of the raised tiles among which many may scatter: of 6 m, for tiles of 0.5 m."""
 SMOOTH, TIMES_OWN, OWN_SHARE = 0.025, 4.5, 0.75
-"""Scatter up to which land is smooth [m]: terrain of KITTI has 0.003 to 0.02, beds and stairs 0.03
+"""Scatter up to which terrain is smooth [m]: that of KITTI has 0.003 to 0.02, beds and stairs 0.03
 to 0.06; what it may be as a multiple of that of the own level, of which this share is smoother."""
 SAMPLED = 2
 """One in so many tiles of the own level tells how much it scatters."""
@@ -154,14 +154,14 @@ def is_examined(extent: Values, over: Values, place: Values, label: LabelConfig)
 def is_beyond_edge(gap: Values, r: Values, over: Values, label: LabelConfig) -> Values:
     """Whether no ground is seen before a candidate, which is `over` the own level [m], and lower.
 
-    A face there is of what stands on lower land behind an edge, which hides its base.
+    A face there is of what stands on lower terrain behind an edge, which hides its base.
     """
     return (gap > longest_gap(r)) & (over < -face_height(label))
 
 
 @shared
 def smooth_up_to(own: Values) -> Values:
-    """Largest scatter of smooth land, where the own level has `own` [m]."""
+    """Largest scatter of smooth terrain, where the own level has `own` [m]."""
     return np.maximum(SMOOTH, TIMES_OWN * own)
 
 
