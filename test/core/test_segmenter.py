@@ -69,7 +69,7 @@ def test_odd_clouds_work_and_determine_no_pose(backend, points):
         assert np.isnan(result.ground_z[0]) == (not is_low)
     pose = result.pose
     assert (pose.height, pose.roll, pose.pitch) == (DEFAULT_HEIGHT, 0.0, 0.0)
-    assert not pose.height_estimated
+    assert not (pose.height_estimated or pose.roll_estimated or pose.pitch_estimated)
     turned = segmenter_of(backend, **{'sensor.roll': 2.0, 'sensor.pitch': 0.3}).segment(points)
     assert len(turned.label) == len(points)
 

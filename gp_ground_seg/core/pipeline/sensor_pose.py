@@ -69,8 +69,10 @@ class SensorPose:
     #: lifts the left side, positive pitch lowers the nose (REP-103)
     roll: float
     pitch: float
-    #: whether the height comes from this scan rather than from the parameters or a default
+    #: whether each comes from this scan rather than from the parameters or a default
     height_estimated: bool = False
+    roll_estimated: bool = False
+    pitch_estimated: bool = False
     measured: MeasuredPose | None = None  #: what the scan says; None if it shows no plane at all
     #: parameters that the scan clearly contradicts, a line for each; they are used as given
     contradictions: tuple[str, ...] = ()
@@ -215,10 +217,13 @@ def _doubts(view: View) -> tuple[str, ...]:
 
 def _levelled(given: SensorPose, up: FloatArray, sensor: SensorConfig) -> SensorPose:
     """Return `given` with angles that turn `up` upwards, as far as those given allow."""
-    roll = rounded(math.atan2(up[1], up[2])) if sensor.roll == AUTO else given.roll
+    frees_roll, frees_pitch = sensor.roll == AUTO, sensor.pitch == AUTO
+    roll = rounded(math.atan2(up[1], up[2])) if frees_roll else given.roll
     across = up[1] * math.sin(roll) + up[2] * math.cos(roll)
-    pitch = rounded(math.atan2(-up[0], across)) if sensor.pitch == AUTO else given.pitch
-    return dataclasses.replace(given, roll=roll, pitch=pitch)
+    pitch = rounded(math.atan2(-up[0], across)) if frees_pitch else given.pitch
+    return dataclasses.replace(
+        given, roll=roll, pitch=pitch, roll_estimated=frees_roll, pitch_estimated=frees_pitch
+    )
 
 
 def _contradictions(sensor: SensorConfig, measured: MeasuredPose, view: View) -> tuple[str, ...]:
