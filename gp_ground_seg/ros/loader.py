@@ -9,10 +9,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from gp_ground_seg.core import jit, segmenter
-from gp_ground_seg.core.backend import Backend, partly_compiled
 from gp_ground_seg.core.parameters.config import Config
+
+if TYPE_CHECKING:
+    from gp_ground_seg.core.backend import Backend
 
 FOLLOWS = (
     'segmenting with numpy until the compiled code is there: a second, or 20 to 60 s to compile it'
@@ -21,17 +23,17 @@ CHANGED = 'segmenting with numba now'
 STAYS = 'segmenting with numpy from now on'
 JOIN_TIMEOUT = 0.5  # longest wait for the thread [s]
 
+PROCESSES = 'learn_frame', 'estimate_surface'
+OTHERS = 'fit_plane', 'find_faces', 'find_relief', 'extract_lines', 'label_points'
+"""Stages of a frame after the grid, of which the first take as long to compile as the others. They
+share the growth of inliers, which one process compiles once."""
 # Behind what the robot does, a little. Collecting garbage less often, as the commands do, saves a
 # tenth of the time.
 _POLITELY = 'import gc; gc.set_threshold(50_000); os.nice(1); '
 _COMPILE = _POLITELY + 'from gp_ground_seg.ros.loader import compile_all; compile_all()'
 _COMPILE_PROCESSES = _POLITELY + (
-    'from gp_ground_seg.ros.loader import compile_but, OTHERS; compile_but(*OTHERS)'
+    f'from gp_ground_seg.ros.loader import compile_but; compile_but(*{OTHERS})'
 )
-PROCESSES = 'learn_frame', 'estimate_surface'
-OTHERS = 'fit_plane', 'find_faces', 'find_relief', 'extract_lines', 'label_points'
-"""Stages of a frame after the grid, of which the first take as long to compile as the others. They
-share the growth of inliers, which one process compiles once."""
 _CHILD = """\
 import os, signal, sys, threading
 sys.path[:] = {path!r}
@@ -54,17 +56,23 @@ def child_command(code: str) -> list[str]:
 
 def compile_all() -> None:
     """Compile all code that a frame needs; where there are two cores, with a child process."""
-    if len(os.sched_getaffinity(0)) > 1 and jit.has_to_compile():
+    from gp_ground_seg.core.jit import has_to_compile
+    from gp_ground_seg.core.segmenter import warm_up
+
+    if len(os.sched_getaffinity(0)) > 1 and has_to_compile():
         # Where it fails, this process compiles that too.
         command, pipe = child_command(_COMPILE_PROCESSES), subprocess.PIPE
         with subprocess.Popen(command, cwd='/', stdin=pipe, stderr=subprocess.DEVNULL):
             compile_but(*PROCESSES)
-    segmenter.warm_up()
+    warm_up()
 
 
 def compile_but(*stages: str) -> None:
     """Compile the code of a frame but for some stages."""
-    segmenter.warm_up(backend=partly_compiled(*stages))
+    from gp_ground_seg.core.backend import partly_compiled
+    from gp_ground_seg.core.segmenter import warm_up
+
+    warm_up(backend=partly_compiled(*stages))
 
 
 class BackendLoader(threading.Thread):
@@ -104,13 +112,15 @@ class BackendLoader(threading.Thread):
         try:
             # It declares the compiled functions: then it is known which of them are on disk.
             import gp_ground_seg.core.compiled.backend  # noqa: F401
+            from gp_ground_seg.core.jit import code_folder, is_code_kept
+            from gp_ground_seg.core.segmenter import warm_up
 
-            if jit.code_folder() is not None and not jit.is_code_kept():
+            if code_folder() is not None and not is_code_kept():
                 self._compile()
             if not self._is_closed:
                 # Not with a given height: the scan that is segmented here has another.
                 config = dataclasses.replace(self._config, sensor=Config().sensor)
-                self.backend = segmenter.warm_up(config)
+                self.backend = warm_up(config)
         except Exception as error:
             self.error = f'{type(error).__name__}: {error}'
         self.seconds = time.monotonic() - start

@@ -406,6 +406,7 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     return float(np.floor(REFUTATION * RESOLUTION * nearness(crossing[counts])).sum())
 
 
+@shared
 def refined(cells: LowestPoints, first: Plane, max_slope: float) -> Plane:
     """Weighted least squares with Tukey's weights of the plane before, again and again.
 
