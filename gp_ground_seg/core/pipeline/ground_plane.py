@@ -358,7 +358,10 @@ def supports_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
 
 @shared
 def levelness(slope_x: Values, slope_y: Values) -> Values:
-    """Fourth power of the cosine of a plane's tilt: a hillside is not better than the valley."""
+    """Fourth power of the cosine of a plane's tilt: a hillside is not better than the valley.
+
+    That of a level plane is `LEVEL`.
+    """
     square = 1.0 / (1.0 + slope_x * slope_x + slope_y * slope_y)
     return choose(square == 1.0, LEVEL, square * square)
 
