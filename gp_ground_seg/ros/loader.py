@@ -27,13 +27,11 @@ PROCESSES = 'learn_frame', 'estimate_surface'
 OTHERS = 'fit_plane', 'find_faces', 'find_relief', 'extract_lines', 'label_points'
 """Stages of a frame after the grid, of which the first take as long to compile as the others. They
 share the growth of inliers, which one process compiles once."""
-# Behind what the robot does, a little. Collecting garbage less often, as the commands do, saves a
-# tenth of the time.
-_POLITELY = 'import gc; gc.set_threshold(50_000); os.nice(1); '
-_COMPILE = _POLITELY + 'from gp_ground_seg.ros.loader import compile_all; compile_all()'
-_COMPILE_PROCESSES = _POLITELY + (
-    f'from gp_ground_seg.ros.loader import compile_but; compile_but(*{OTHERS})'
-)
+# Collecting garbage less often, as the commands do, saves a tenth of the time.
+_QUICKLY = 'import gc; gc.set_threshold(50_000); from gp_ground_seg.ros import loader; '
+_COMPILE_PROCESSES = f'{_QUICKLY} loader.compile_but(*{OTHERS})'
+# Behind what the robot does: its child inherits this, and two such weigh less than one process.
+_COMPILE = f'{_QUICKLY} os.nice(4); loader.compile_all()'
 _CHILD = """\
 import os, signal, sys, threading
 sys.path[:] = {path!r}
