@@ -52,7 +52,7 @@ def main_managed() -> int:
 
 
 def run_warm_up(_arguments: argparse.Namespace) -> int:
-    """Compile all code that a frame needs, in this process."""
+    """Compile all code that a frame needs."""
     from gp_ground_seg.core.jit import HAVE_NUMBA, code_folder
     from gp_ground_seg.ros.loader import compile_all
 

@@ -1,21 +1,17 @@
-"""``plot``: pictures of a segmented scan; ``tune``: a scan in the browser, with sliders."""
+"""``plot``: pictures of a segmented scan: in perspective, or segments of it from the side."""
 
 from __future__ import annotations
 
 import argparse
-import shlex
 from pathlib import Path
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
-from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.files import check_writable, staged_file, write_file
+from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.semantic_kitti import read_entries
 from gp_ground_seg.lab import plotting
 from gp_ground_seg.lab.scoring.metrics import true_labels
-from gp_ground_seg.lab.tuner import Tuner, open_server, tunable
 
 SCAN = """\
 Draw a scan in perspective: ground grey, obstacles orange; with --labels missed ground blue and
@@ -37,25 +33,12 @@ SEGMENT_EXAMPLES = """\
   gp-ground-seg plot segment 000000.bin --segment 90 -o ahead.pdf
   gp-ground-seg plot segment 000000.bin --segment 157,158 -o pair.png
 """
-TUNE = """\
-Show a scan in the browser, with sliders for the parameters. Labels follow at once,
-and points that change their class have a colour. With labels of SemanticKITTI, IoU and objects
-lost are shown too. A button writes the parameters as YAML, and a line tells how to load the file
-into a running node. The page is served to this machine only. Ctrl-C stops it.
-"""
-TUNE_EXAMPLES = """\
-  gp-ground-seg tune 000000.bin
-  gp-ground-seg tune KITTI_ROOT/sequences/00 --frame 5 -o kitti.yaml
-  gp-ground-seg tune drive.mcap --parameters sensor.height,faces.cell_size
-
-needs the package viser (docs/install.md)
-"""
 KINDS = ('.png', '.pdf', '.svg')
 ENDINGS = ' or '.join(KINDS)
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the commands, and the pictures of `plot`."""
+    """Declare the command and its pictures."""
     description = 'Draw a segmented scan: in perspective, or one segment of it.'
     examples = SCAN_EXAMPLES + SEGMENT_EXAMPLES
     parser = options.new_parser(subparsers, 'plot', description, examples)
@@ -85,36 +68,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             options.FORCE,
         )  # fmt: skip
         options.add_config(picture)
-        picture.set_defaults(run=run_plot)
-    _add_tune(subparsers)
+        picture.set_defaults(run=run)
 
 
-def _add_tune(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare `tune`."""
-    parser = options.new_parser(subparsers, 'tune', TUNE, TUNE_EXAMPLES)
-    file, specs = {'metavar': 'FILE'}, tunable()
-    basic = [spec.name for spec in specs if spec.basic]
-    names = options.some_of(spec.name for spec in specs)
-    options.add(
-        parser,
-        ('input', 'scan, folder of scans, sequence or bag', {'metavar': 'INPUT'}),
-        ('--labels', 'SemanticKITTI labels of a scan (default: those beside it)', file),
-        ('--frame', 'number of the first frame to show, from 0',
-         {'metavar': 'N', 'type': int, 'default': 0}),
-        ('--port', 'of the page, or the next free one (default: %(default)s)',
-         {**options.NUMBER, 'default': 9090}),
-        ('--parameters', 'those to show (default: the basic ones)',
-         {'metavar': 'NAME,NAME', 'type': names, 'default': basic}),
-        ('-o --output', 'file to write (default: %(default)s)', {**file, 'default': 'tuned.yaml'}),
-        *options.CLOUDS,
-        options.FORCE,
-        options.QUIET,
-    )  # fmt: skip
-    options.add_config(parser)
-    parser.set_defaults(run=run_tune)
-
-
-def run_plot(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Segment the scan and draw it."""
     config = options.read_config(arguments)
     path = Path(arguments.output)
@@ -141,29 +98,6 @@ def run_plot(arguments: argparse.Namespace) -> int:
     print(f'sensor: {plotting.words_of_pose(result.pose)}')
     print(f'{said}, written to {shown(path)}')
     options.note_spared(config, used)
-    return 0
-
-
-def run_tune(arguments: argparse.Namespace) -> int:
-    """Serve the page."""
-    inputs, config = options.list_clouds(arguments), options.read_config(arguments)
-    output, is_ours = Path(arguments.output), arguments.force
-    check_writable(output, force=is_ours)
-    load = f'ros2 param load /{NODE_NAME} {shlex.quote(str(output))}'
-
-    def write(values: Config) -> str:
-        nonlocal is_ours
-        with staged_file(output, force=is_ours) as part:
-            write_file(part, values.to_yaml('Found with gp-ground-seg tune.').encode())
-        is_ours = True
-        return f'written to {output}; a running node takes it by {load}'
-
-    with open_server(arguments.port) as (server, address):
-        begin = arguments.parameters, arguments.labels, arguments.frame
-        tuner = Tuner(server, inputs, config, *begin)
-        tuner.add_button(f'write {output.name}', write)
-        print(f'{address}\nCtrl-C ends it.', flush=True)
-        tuner.run()
     return 0
 
 

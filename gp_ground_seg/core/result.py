@@ -280,14 +280,14 @@ class Segmentation:
     def return_std(self) -> FloatArray:
         """Standard deviation of the height of a ground return, (N,) float64 [m].
 
-        About `ground_z`: surface, roughness and range noise together. NaN without a model. Errors
-        have longer tails than a normal distribution, so that their mean square is too much: it is
-        scaled until as many of the returns called ground are within it as of a normal one.
+        About `ground_z`: surface, roughness and range noise together. NaN without a model. Some
+        errors are so large that their root mean square is too wide for the others: that is scaled
+        until as many returns called ground are within it as of a normal distribution.
         """
-        std, own = self._at_points(self.corrected.return_std), self.is_ground
-        errors = np.abs(self.height[own]) / std[own]
+        rms, own = self._at_points(self.corrected.return_rms), self.is_ground
+        errors = np.abs(self.height[own]) / rms[own]
         scale = np.quantile(errors, WITHIN_STD) if len(errors) else 1.0
-        return np.maximum(scale * std, self.ground_std)
+        return np.maximum(scale * rms, self.ground_std)
 
     def _at_points(self, table: FloatArray) -> FloatArray:
         return at_points(self.surface.knots, table, self.grid).astype(np.float64)

@@ -35,7 +35,6 @@ from gp_ground_seg.core.pipeline.ground_view import (
     is_doubtful,
     objection_to_ground,
 )
-from gp_ground_seg.core.pipeline.low_sensor import for_sensor, sensor_height_of
 from gp_ground_seg.core.pipeline.mirror_images import (
     MIRRORED,
     NO_IMAGES,
@@ -55,7 +54,9 @@ from gp_ground_seg.core.pipeline.sensor_pose import (
     CLEAR_TILT,
     SensorPose,
     estimate_pose,
+    for_sensor,
     given_pose,
+    sensor_height_of,
     with_fallback,
 )
 from gp_ground_seg.core.result import Segmentation

@@ -54,10 +54,11 @@ def child_command(code: str) -> list[str]:
 
 def compile_all() -> None:
     """Compile all code that a frame needs; where there are two cores, with a child process."""
-    from gp_ground_seg.core.jit import has_to_compile
+    from gp_ground_seg.core.jit import code_folder, is_code_kept
     from gp_ground_seg.core.segmenter import warm_up
 
-    if len(os.sched_getaffinity(0)) > 1 and has_to_compile():
+    is_shared = code_folder() is not None and len(os.sched_getaffinity(0)) > 1
+    if is_shared and not is_code_kept():
         # Where it fails, this process compiles that too.
         command, pipe = child_command(_COMPILE_PROCESSES), subprocess.PIPE
         with subprocess.Popen(command, cwd='/', stdin=pipe, stderr=subprocess.DEVNULL):

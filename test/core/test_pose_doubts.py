@@ -21,7 +21,7 @@ from test_sensor_pose import (
 from gp_ground_seg import Config
 from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.parameters.config import find_spec
-from gp_ground_seg.core.pipeline import low_sensor
+from gp_ground_seg.core.pipeline import sensor_pose
 from gp_ground_seg.core.pipeline.ground_view import LOWER_ENDS
 from gp_ground_seg.core.pipeline.sensor_pose import (
     LITTLE_GROUND,
@@ -37,34 +37,34 @@ GATES = 'growth.max_std', 'growth.seed_height_tolerance', 'label.obstacle_min_he
 
 
 def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicle():
-    config, reference = Config(), low_sensor.REFERENCE_HEIGHT
+    config, reference = Config(), sensor_pose.REFERENCE_HEIGHT
     mounts = (0.6, 0.0, 0.6), (0.15, 0.0, 0.15), *((1.73, z, reference) for z in (0.0, 1.53, 1.73))
     for height, lift, expected in mounts:
         pose = pose_of(moved(scan_of('kerb', SMALL_VLP, height).points, lift))
-        found = low_sensor.sensor_height_of(pose)
+        found = sensor_pose.sensor_height_of(pose)
         assert found == pytest.approx(expected, abs=0.04)
-        own, share = low_sensor.for_sensor(config, pose), expected / reference
+        own, share = sensor_pose.for_sensor(config, pose), expected / reference
         if share == 1.0:
             assert own is config
             continue
         for name in GATES:
             assert own[name] == pytest.approx(share * config[name], rel=0.3)
-        least = max(0.1 * share, low_sensor.LEAST_TOLERANCE)
+        least = max(0.1 * share, sensor_pose.LEAST_TOLERANCE)
         assert own.label.ground_tolerance == pytest.approx(least, abs=0.005)
         # A smaller one that is given stays, and the paper's rule knows no height of the sensor.
         fine = config.replace(**{'label.ground_tolerance': 0.02})
-        assert low_sensor.for_sensor(fine, pose).label.ground_tolerance == 0.02
+        assert sensor_pose.for_sensor(fine, pose).label.ground_tolerance == 0.02
         paper = config.replace(**{'label.rule': 'tolerance'})
-        assert low_sensor.for_sensor(paper, pose) is paper
+        assert sensor_pose.for_sensor(paper, pose) is paper
         # What is at its least already is not refused.
         names = (*GATES, 'label.ground_tolerance', 'grid.r_min')
         tiny = config.replace(**{name: find_spec(name).minimum for name in names})
-        assert low_sensor.for_sensor(tiny, pose) == tiny
+        assert sensor_pose.for_sensor(tiny, pose) == tiny
     # The sensor is where the origin is given to be.
     points = moved(scan_of('kerb', SMALL_VLP, 0.15).points, 0.15)
     pose = pose_of(points, origin_z=0.15)
-    assert low_sensor.sensor_height_of(pose) == pytest.approx(0.15, abs=0.04)
-    assert low_sensor.sensor_height_of(pose_of(points)) == reference
+    assert sensor_pose.sensor_height_of(pose) == pytest.approx(0.15, abs=0.04)
+    assert sensor_pose.sensor_height_of(pose_of(points)) == reference
 
 
 def desks(gap):

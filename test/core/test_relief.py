@@ -97,7 +97,7 @@ def test_the_relief_is_that_of_a_bank(backend, degrees):
 
 
 @pytest.mark.parametrize(('at', 'depth'), [(5.0, 1.2), (7.5, 2.0), (10.0, 3.0)])
-def test_land_ends_at_an_edge_and_goes_on_below(backend, at, depth):
+def test_terrain_ends_at_an_edge_and_goes_on_below(backend, at, depth):
     """What the edge hides is left out: the relief follows the terrain up to it, on both sides."""
     candidates = candidates_on(lambda x, y: np.where(x > at, -depth, 0.0), RINGS)
     seen = at * (HEIGHT + depth) / HEIGHT
@@ -118,7 +118,7 @@ def box(x0, x1, y0, y1, high):
     return terrain
 
 
-LEVEL_LAND = {
+LEVEL_TERRAIN = {
     'camber': lambda x, y: -0.1 * np.abs(y / 40.0),
     'bonnet': lambda x, y: box(6.0, 10.0, 2.0, 3.8, 0.9)(x, y) * (1.0 - 0.1 * (x - 6.0)),
     'truck': box(8.0, 20.0, 3.0, 5.5, 3.2),
@@ -128,10 +128,10 @@ LEVEL_LAND = {
 }
 
 
-@pytest.mark.parametrize('name', LEVEL_LAND)
+@pytest.mark.parametrize('name', LEVEL_TERRAIN)
 @pytest.mark.parametrize('share', [1.0, 0.5])
 def test_no_relief_is_what_cannot_be_climbed(backend, name, share):
-    candidates = candidates_on(LEVEL_LAND[name], RINGS, share=share)
+    candidates = candidates_on(LEVEL_TERRAIN[name], RINGS, share=share)
     relief, over = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
     assert relief.is_level
     assert over is candidates

@@ -29,7 +29,7 @@ def test_the_correction_by_hand():
     heights = np.concatenate([one, other, third])
     labelled = Labelled(np.full(7, Label.GROUND, np.uint8), heights, heights)
     found = correct_surface(surface, labelled, grid, noise, slope_std)
-    values = np.stack([found.correction, found.std, found.return_std], axis=-1)
+    values = np.stack([found.correction, found.std, found.return_rms], axis=-1)
 
     e = heights[:5].mean()
     between = (3.0 * (one.mean() - e) ** 2 + 2.0 * (other.mean() - e) ** 2) / 5.0
@@ -49,7 +49,7 @@ def test_the_correction_by_hand():
     np.testing.assert_allclose(values[4, 5], unseen, atol=1e-6)
     np.testing.assert_array_equal(np.isnan(found.mean), np.isnan(mean))
     np.testing.assert_allclose(found.mean, mean + found.correction)
-    assert (found.return_std >= found.std)[np.isfinite(mean)].all()
+    assert (found.return_rms >= found.std)[np.isfinite(mean)].all()
     # Cells that agree by chance.
     level = Labelled(labelled.label, np.full(7, 0.02), np.full(7, 0.02))
     assert correct_surface(surface, level, grid, noise, slope_std).std[0, 0] == LEAST_STD

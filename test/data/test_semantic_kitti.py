@@ -3,10 +3,35 @@
 import numpy as np
 import pytest
 from evaluation_samples import street, write_frame, write_streets
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data import semantic_kitti
-from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences
+from gp_ground_seg.data.semantic_kitti import Frame, list_frames, list_sequences, read_points
+
+FLOATS = st.floats(-1e4, 1e4, width=32) | st.sampled_from([np.nan, np.inf, -np.inf])
+
+
+@given(
+    hnp.arrays('<f4', st.tuples(st.integers(0, 20), st.just(4)), elements=FLOATS),
+    hnp.arrays('<u4', st.integers(0, 20)),
+)
+def test_points_come_back_bit_for_bit_and_labels_are_the_lower_half(
+    tmp_path_factory, points, entries
+):
+    folder = tmp_path_factory.mktemp('frame')
+    points = np.vstack([points, np.ones((1, 4), '<f4')])
+    (folder / 'a.bin').write_bytes(points.tobytes())
+    read = read_points(folder / 'a.bin')
+    assert (read.dtype, read.shape) == (np.float32, points.shape)
+    assert read.tobytes() == points.tobytes()
+    assert read.flags.writeable
+    entries = np.resize(entries, len(points))
+    (folder / 'a.label').write_bytes(entries.tobytes())
+    frame = Frame('00', 'a', folder / 'a.bin', folder / 'a.label', 0.0)
+    assert frame.semantic.tolist() == [int(entry) % 65536 for entry in entries]
 
 
 def test_sequences_and_frames_are_sorted_and_need_scans(tmp_path):
@@ -14,9 +39,8 @@ def test_sequences_and_frames_are_sorted_and_need_scans(tmp_path):
         list_sequences(tmp_path)
     write_streets(tmp_path, s08=1, s10=1)
     points, semantic = street()
-    points[0], entries = [np.nan, np.inf, -np.inf, 0.0], semantic | np.uint32(7 << 16)
     for index in (10, 2, 1):
-        write_frame(tmp_path, '00', index, points, entries if index != 2 else None)
+        write_frame(tmp_path, '00', index, points, semantic if index != 2 else None)
     (tmp_path / 'sequences' / '03').mkdir()
     (tmp_path / 'sequences' / 'notes.txt').write_text('')
     assert list_sequences(tmp_path) == list_sequences(str(tmp_path)) == ['00', '08', '10']
@@ -24,9 +48,7 @@ def test_sequences_and_frames_are_sorted_and_need_scans(tmp_path):
     assert [frame.index for frame in frames] == ['000001', '000002', '000010']
     assert [frame.labels_path is not None for frame in frames] == [True, False, True]
     assert all(frame.sequence == '00' for frame in frames)
-    read = frames[0].points  # bit for bit
-    assert (read.dtype, read.tobytes()) == (np.float32, points.tobytes()) and read.flags.writeable
-    np.testing.assert_array_equal(frames[0].semantic, semantic)
+    assert frames[0].points_path.read_bytes() == points.tobytes()
     (tmp_path / 'sequences/08/velodyne/000000.bin').unlink()
     with pytest.raises(DataError, match=r'no velodyne/\*\.bin in it'):
         list_frames(tmp_path, '08')

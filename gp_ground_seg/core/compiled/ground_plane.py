@@ -16,8 +16,6 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     N_RINGS,
     N_SECTORS,
     N_TOGETHER,
-    REFUTATION,
-    RESOLUTION,
     RING_EDGES,
     GroundPlane,
     Loops,
@@ -26,12 +24,13 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     Plane,
     best_of,
     cells_of,
+    crossing_of,
     described,
     distance,
     levelness,
-    nearness,
     own_level,
     refined,
+    refutation_by,
     set_hypotheses,
     support_by,
     tolerance_at,
@@ -50,8 +49,7 @@ def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     return described(cells, *own_level(cells, max_slope, _LOOPS))
 
 
-_entry = jit(entry=True)
-_LOOPS = Loops(_entry(set_hypotheses), _entry(best_of), _entry(refined))
+_LOOPS = Loops(jit(entry=True)(set_hypotheses), jit(entry=True)(best_of), jit(entry=True)(refined))
 
 
 @jit(entry=True)
@@ -130,16 +128,13 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
             reach[cells.cell[c] // N_RINGS] = max(r[c], LEAST_REACH)
     refutation = 0.0
     for c in range(len(x)):
-        height, crossing = distance(x[c], y[c], z[c], plane), r[c]
+        height = distance(x[c], y[c], z[c], plane)
         if height * cells.inverse[c] < -CLEARLY_OFF and not cells.is_alone[c]:
-            # A ray below the plane all the way, as that of a ceiling, is taken to cross it where
-            # it ends.
-            if plane[0] > 0.0:
-                crossing *= plane[0] / (plane[0] - height)
+            crossing = crossing_of(r[c], height, plane)
             sector = cells.cell[c] // N_RINGS
             ring = np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
             if crossing < reach[sector] and not is_seen[sector * N_RINGS + ring]:
-                refutation += np.floor(REFUTATION * RESOLUTION * nearness(crossing))
+                refutation += refutation_by(crossing)
     return refutation
 
 

@@ -52,7 +52,7 @@ def label_points(
     scan: Scan,
     faces: Faces,
     pieces: PointArray,
-    terrain: PointArray,
+    relief: PointArray,
     is_level: bool,
     nearest: float,
     config: LabelConfig,
@@ -67,12 +67,12 @@ def label_points(
     """Height, label and margin of each point, into `result`.
 
     Here `Scan.xyz` is (3, N). `pieces` are those of `linear_pieces`, from the range `nearest` on,
-    `terrain` those of the relief, and `is_level` says whether it is level; `depth`, `highest`,
+    `relief` those of the relief, and `is_level` says whether it is level; `depth`, `highest`,
     `units`, `shift` and `lowest` are those of `depth_of_ground`, `highest_ground`, `sum_units`,
     `number_shift` and `lowest_of`; `by_roughness` is the rule of the parameters.
     """
     n_tiles, number = len(scan.tiles.place), result.height.dtype.type
-    tables, roughness = (pieces, terrain, is_level, number(nearest)), np.zeros(n_tiles + 1)
+    tables, roughness = (pieces, relief, is_level, number(nearest)), np.zeros(n_tiles + 1)
     near_tile, sums = _survey(scan, *tables, highest, units, shift, result.height)
     if by_roughness:
         set_roughness(scan.tiles, sums, faces.is_face, units, shift, roughness)
@@ -91,7 +91,7 @@ def label_points(
 def _survey(
     scan: Scan,
     pieces: PointArray,
-    terrain: PointArray,
+    relief: PointArray,
     is_level: bool,
     nearest: float,
     highest: float,
@@ -113,7 +113,7 @@ def _survey(
         if not is_level:
             find_places(x[block], y[block], u, v, piece)
         r, cell = scan.grid.r[block], scan.grid.cell[block]
-        _measure(z[block], r, cell, nearest, pieces, terrain, u, v, piece, height[block])
+        _measure(z[block], r, cell, nearest, pieces, relief, u, v, piece, height[block])
         tile = scan.tiles.tile[block]
         _add_squares(height[block], tile, highest, units, flag, near_tile[block], terms, sums)
     return near_tile, sums
@@ -126,23 +126,18 @@ def _measure(
     cell: CellArray,
     nearest: float,
     pieces: PointArray,
-    terrain: PointArray,
+    relief: PointArray,
     u: PointArray,
     v: PointArray,
     piece: CellArray,
     height: PointArray,
 ) -> None:
-    """Heights of the points of a block over the surface and the terrain."""
+    """Heights of the points of a block over the surface and the relief."""
     outside = np.int32(len(pieces) // 2 - 1)
     for i in range(len(z)):
         c = np.uintp(2) * np.uintp(cell[i] if cell[i] >= 0 else outside)
         p = np.uintp(4) * np.uintp(piece[i] if cell[i] >= 0 else np.int32(0))
-        own = (
-            terrain[p],
-            terrain[p + np.uintp(1)],
-            terrain[p + np.uintp(2)],
-            terrain[p + np.uintp(3)],
-        )
+        own = relief[p], relief[p + np.uintp(1)], relief[p + np.uintp(2)], relief[p + np.uintp(3)]
         under = pieces[c] + pieces[c + np.uintp(1)] * max(r[i], nearest)
         height[i] = z[i] - under - height_in(own, u[i], v[i])
 

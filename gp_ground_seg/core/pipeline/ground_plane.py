@@ -385,6 +385,21 @@ def support_by(
     return np.floor(choose(near > 0.0, RESOLUTION * weight * near * near, 0.0))
 
 
+@shared
+def crossing_of(r: Values, height: Values, plane: Plane) -> Values:
+    """Range at which the ray to a point that is so high over a plane crosses it [m].
+
+    A ray below the plane all the way, as that of a ceiling, is taken to cross it where it ends.
+    """
+    return r * plane[0] / (plane[0] - height) if plane[0] > 0.0 else r
+
+
+@shared
+def refutation_by(crossing: Values) -> Values:
+    """Refutation of a plane by a ray that crosses it at a range; a whole number."""
+    return np.floor(REFUTATION * RESOLUTION * nearness(crossing))
+
+
 def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     """Weight of the rays that cross a plane where it should have stopped them; a whole number.
 
@@ -400,13 +415,11 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     is_seen[cells.cell[is_on]] = True
     # The farthest is the last of a sector.
     reach[sector[is_on]] = np.maximum(cells.r[is_on], LEAST_REACH)
-    sector, crossing = sector[is_below], cells.r[is_below]
-    # A ray below the plane all the way, as that of a ceiling, is taken to cross it where it ends.
-    if plane[0] > 0.0:
-        crossing = crossing * plane[0] / (plane[0] - height[is_below])
+    sector = sector[is_below]
+    crossing = crossing_of(cells.r[is_below], height[is_below], plane)
     crossed = sector * N_RINGS + np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
     counts = (crossing < reach[sector]) & ~is_seen[crossed]
-    return float(np.floor(REFUTATION * RESOLUTION * nearness(crossing[counts])).sum())
+    return float(refutation_by(crossing[counts]).sum())
 
 
 @shared

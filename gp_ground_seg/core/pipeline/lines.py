@@ -284,7 +284,7 @@ def find_onward(candidates: Candidates, growth: GrowthConfig, onward: FloatArray
     """
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     for m in range(len(offsets) - 1):
-        # `far` is the first that is far enough, `step` the one behind the last without a step.
+        # The first that is far enough from c; the first that no walkable steps from c lead to.
         far = step = offsets[m]
         for c in range(offsets[m], offsets[m + 1]):
             onward[c] = -math.inf

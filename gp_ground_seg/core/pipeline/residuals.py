@@ -59,7 +59,7 @@ class CorrectedSurface(NamedTuple):
     correction: FloatArray  # what is added to the height that the process gives [m]
     mean: FloatArray  # height of the ground in the level frame [m]
     std: FloatArray  # standard deviation of the height of the ground [m]
-    return_std: FloatArray  # root mean square of the height of a return over the ground [m]
+    return_rms: FloatArray  # root mean square of the height of a return over the ground [m]
 
 
 def correct_surface(
@@ -111,8 +111,8 @@ def correct_surface(
         whole[unseen] = variance[unseen] + noise[unseen]
     mean, std = surface.mean + correction, np.maximum(np.sqrt(variance), LEAST_STD)
     # Returns lie on the ground: they depart from the surface no less than it.
-    return_std = np.maximum(np.sqrt(whole), std)
-    return CorrectedSurface(surface.knots, correction, mean, std, return_std)
+    return_rms = np.maximum(np.sqrt(whole), std)
+    return CorrectedSurface(surface.knots, correction, mean, std, return_rms)
 
 
 def _unbiased_variance(

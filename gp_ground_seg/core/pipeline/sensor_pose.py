@@ -11,7 +11,7 @@ import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import FloatArray, PointArray, usual_errors
-from gp_ground_seg.core.parameters.config import SensorConfig
+from gp_ground_seg.core.parameters.config import Config, SensorConfig, find_spec
 from gp_ground_seg.core.parameters.schema import AUTO
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.ground_view import View, refusal
@@ -42,6 +42,12 @@ HEIGHT_CONTRADICTION = 0.3
 """Difference to a given height from which the scan contradicts it [m]."""
 TILT_CONTRADICTION = 0.15
 """Tilt left under given angles from which the scan contradicts them [rad]: no usual slope."""
+REFERENCE_HEIGHT = 1.0
+"""Height of a sensor over the ground from which parameters are used as they are given [m]."""
+LOWEST = 0.1
+"""Height below which the origin of a cloud is no sensor [m]."""
+LEAST_TOLERANCE = 0.04
+"""Least tolerance of ground that a low sensor leads to [m]: twice the noise of its ranges."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +117,10 @@ class SensorPose:
 
     @cached_property
     def rotation(self) -> FloatArray:
-        """Matrix (3, 3) from the sensor frame to the level frame."""
-        return rotation(self.roll, self.pitch)
+        """Matrix (3, 3) from the sensor frame to the level frame; not to be written to."""
+        matrix = rotation(self.roll, self.pitch)
+        matrix.flags.writeable = False
+        return matrix
 
     def level(self, xyz: PointArray) -> PointArray:
         """Points (N, 3) of the sensor frame in the level frame; `xyz` itself without tilt."""
@@ -247,3 +255,34 @@ def _contradictions(sensor: SensorConfig, measured: MeasuredPose, view: View) ->
                 f'{measured.roll:.3f}, pitch = {measured.pitch:.3f}'
             )
     return tuple(found)
+
+
+def for_sensor(config: Config, pose: SensorPose) -> Config:
+    """Return `config` with what depends on the height of the sensor in proportion to it.
+
+    A small robot must stop for objects that a car drives over. Its level beams hit objects at the
+    height of the sensor, for example 0.4 m: far from the last ring on the ground, a gate wider
+    than that would accept trunks, persons and cars as ground.
+
+    These are the gates of the growth, the tolerance of ground and the least height of obstacles;
+    nothing for a sensor that is as high as `REFERENCE_HEIGHT`, or that is not seen to be lower.
+    """
+    share = sensor_height_of(pose) / REFERENCE_HEIGHT
+    if share >= 1.0 or config.label.rule != 'roughness':
+        return config
+    names = (
+        'grid.r_min',
+        'growth.seed_height_tolerance',
+        'growth.max_std',
+        'label.ground_tolerance',
+        'label.obstacle_min_height',
+    )
+    least = {name: float(find_spec(name).minimum or 0.0) for name in names}
+    least['label.ground_tolerance'] = min(LEAST_TOLERANCE, config.label.ground_tolerance)
+    return config.replace(**{name: max(share * config[name], least[name]) for name in names})
+
+
+def sensor_height_of(pose: SensorPose) -> float:
+    """Height of a low sensor over the ground, `REFERENCE_HEIGHT` of others [m]."""
+    is_there = pose.starts_rays and pose.sensor_height >= LOWEST
+    return min(pose.sensor_height, REFERENCE_HEIGHT) if is_there else REFERENCE_HEIGHT

@@ -8,7 +8,7 @@ import platform
 import subprocess
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from importlib.metadata import distributions
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -163,14 +163,13 @@ def describe_environment(*packages: str) -> dict[str, Any]:
 
     The commit is None outside git.
     """
-    known = {one.metadata['Name']: one.version for one in distributions()}
     return {
         'cpu': _cpu_name(),
         'n_cores': len(os.sched_getaffinity(0)),
         'python': platform.python_version(),
         'versions': {
             'gp_ground_seg': gp_ground_seg.__version__,
-            **{name: known.get(name) for name in ('numpy', 'scipy', 'numba', *packages)},
+            **{name: _version_of(name) for name in ('numpy', 'scipy', 'numba', *packages)},
         },
         'commit': _commit(Path(gp_ground_seg.__file__)),
     }
@@ -190,6 +189,12 @@ def machine_line(environment: Mapping[str, Any], backend: str) -> str:
         return machine  # installed, not run from a checkout
     commit, _, dirty = environment['commit'].partition('-')
     return f'{machine}, commit {commit[:12]}{" (changed since)" if dirty else ""}'
+
+
+def _version_of(package: str) -> str | None:
+    with suppress(PackageNotFoundError):
+        return version(package)
+    return None
 
 
 def _cpu_name() -> str:

@@ -29,23 +29,28 @@ Kind = IntEnum(
 """What a ray can hit."""
 
 
-CLASSES, REFLECTANCES = np.array([
-    (40, 0.25),  # road
-    (10, 0.5),  # car
-    (50, 0.4),  # building
-    (80, 0.6),  # pole
-    (52, 0.35),  # other structure; scored as an obstacle, unlike vegetation
-    (1, 0.05),  # outlier
-    (70, 0.3),  # vegetation
-    (30, 0.3),  # person
-    (31, 0.3),  # bicyclist
-]).T  # fmt: skip
-"""By `Kind`: class in SemanticKITTI, and share of the light that comes back."""
+# In order of the codes: class in SemanticKITTI, and share of the light that comes back.
+_CLASS_AND_REFLECTANCE: dict[Kind, tuple[int, float]] = {
+    Kind.TERRAIN: (40, 0.25),  # road
+    Kind.BOX: (10, 0.5),  # car
+    Kind.WALL: (50, 0.4),  # building
+    Kind.POLE: (80, 0.6),  # pole
+    Kind.OVERHANG: (52, 0.35),  # other structure; scored as an obstacle, unlike vegetation
+    Kind.REFLECTION: (1, 0.05),  # outlier
+    Kind.VEGETATION: (70, 0.3),  # vegetation
+    Kind.PERSON: (30, 0.3),  # person
+    Kind.CYCLIST: (31, 0.3),  # bicyclist
+}
 
 
 def semantic_kitti_labels(kind: KindArray) -> npt.NDArray[np.uint32]:
     """Class in SemanticKITTI of each `Kind` code, (N,) uint32, as ``.label`` files hold them."""
-    return np.asarray(CLASSES[kind], dtype=np.uint32)
+    return np.array([label for label, _ in _CLASS_AND_REFLECTANCE.values()], dtype=np.uint32)[kind]
+
+
+def reflectance(kind: KindArray) -> npt.NDArray[np.float64]:
+    """Share of the light that each `Kind` code sends back, (N,) float64 in [0, 1]."""
+    return np.array([share for _, share in _CLASS_AND_REFLECTANCE.values()])[kind]
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.lab.simulation.objects import (
-    REFLECTANCES,
     Kind,
     KindArray,
     nearest_solid,
     number_objects,
+    reflectance,
 )
 from gp_ground_seg.lab.simulation.scenes import Scene
 from gp_ground_seg.lab.simulation.terrain import Terrain, first_hit
@@ -235,7 +235,7 @@ def _cast(
     kind = kind[kept]
     points = np.empty((len(kept), 4), dtype=np.float32)
     points[:, :3] = beams[kept] * measured[kept, None] + start
-    points[:, 3] = np.clip(REFLECTANCES[kind] + 0.05 * intensity_noise[kept], 0.0, 1.0)
+    points[:, 3] = np.clip(reflectance(kind) + 0.05 * intensity_noise[kept], 0.0, 1.0)
     return points, kind, object_id[kept]
 
 
