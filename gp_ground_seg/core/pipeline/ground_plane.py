@@ -228,8 +228,8 @@ def own_level(cells: LowestPoints, max_slope: float, loops: Loops) -> tuple[Plan
     """Plane of the level that the robot stands on, and height of another level or infinity.
 
     It is the plane with the best score, or a parallel one that is not refuted and goes on to where
-    the robot stands, as the best one does not. It is refined by the points that are nearer to it
-    than to the other.
+    the robot stands, as the best one does not. Where the other is tight, the points that are nearer
+    to it do not refine the plane; waves of one level are not.
     """
     planes = np.empty((N_LEVEL + N_TRIPLES, 3))
     planes = planes[: loops.set_hypotheses(cells, max_slope, planes)]
@@ -248,8 +248,8 @@ def own_level(cells: LowestPoints, max_slope: float, loops: Loops) -> tuple[Plan
         aside, other_aside = asideness(cells, best, other), asideness(cells, other, best)
         if other_aside < OWN * aside:
             best, other, d, from_other = other, best, from_other, d
-    nearer = cells._replace(inverse=np.where(d <= from_other, cells.inverse, 0.0))
-    return loops.refined(nearer, best, max_slope), other[0]
+        cells = cells._replace(inverse=np.where(d <= from_other, cells.inverse, 0.0))
+    return loops.refined(cells, best, max_slope), other[0]
 
 
 @shared
