@@ -228,8 +228,8 @@ def own_level(cells: LowestPoints, max_slope: float, loops: Loops) -> tuple[Plan
     """Plane of the level that the robot stands on, and height of another level or infinity.
 
     It is the plane with the best score, or a parallel one that is not refuted and goes on to where
-    the robot stands, as the best one does not. Where the other is tight, the points that are nearer
-    to it do not refine the plane; waves of one level are not.
+    the robot stands, as the best one does not. Points that are nearer to a tight other level do
+    not refine it; the crests of waves are not tight.
     """
     planes = np.empty((N_LEVEL + N_TRIPLES, 3))
     planes = planes[: loops.set_hypotheses(cells, max_slope, planes)]
