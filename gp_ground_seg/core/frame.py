@@ -191,11 +191,13 @@ class Faces(NamedTuple):
     is_face: BoolArray
     # (T + 1,) whether even the lowest returns belong to the face: the tile shows no ground
     has_occluded_base: BoolArray
+    # (T + 1,) whether the returns above the lowest are steeper than terrain: no way leads over it
+    is_steep: BoolArray
 
     @classmethod
     def none(cls, tiles: Tiles) -> Faces:
         """No tile has one."""
-        return cls(*np.zeros((2, len(tiles.place) + 1), dtype=np.bool_))
+        return cls(*np.zeros((3, len(tiles.place) + 1), dtype=np.bool_))
 
 
 class Lines(NamedTuple):

@@ -170,7 +170,7 @@ class GroundSegmenter:
         timer.mark('faces')
         # 4. Relief of the terrain; lines along each segment, over it, without lowest points of
         #    faces with occluded base; pseudo-inputs. The prior mean is the ground near the sensor.
-        relief, candidates = backend.find_relief(scan.candidates, faces, height, config)
+        relief, candidates, faces = backend.find_relief(scan.candidates, faces, height, config)
         candidates, lines, pseudo, onward, in_face = backend.extract_lines(
             candidates, faces, config
         )

@@ -19,7 +19,7 @@ from gp_ground_seg.core.pipeline.lines import (
 )
 
 N_TILES = 50
-NO_FACES = Faces(*np.zeros((2, N_TILES), dtype=bool))
+NO_FACES = Faces(*np.zeros((3, N_TILES), dtype=bool))
 
 
 def candidates_of(r, z, density=None, offsets=None):
@@ -74,7 +74,7 @@ BOUNDS = 'growth.max_slope', 'growth.min_rise_extent', 'lines.max_density_ratio'
 
 
 def draw_faces(seed):
-    return Faces(*(np.random.default_rng(seed).uniform(size=(2, N_TILES)) < 0.2))
+    return Faces(*(np.random.default_rng(seed).uniform(size=(3, N_TILES)) < 0.2))
 
 
 @settings(max_examples=fewer(40, 20))

@@ -14,7 +14,7 @@ from gp_ground_seg.core.pipeline.relief import N_SIDES, Relief
 
 HEIGHT, N_TILES = 1.8, 50
 MIDDLES = 2.0 * np.arange(N_SIDES) - 59.0
-NO_FACES = Faces(*np.zeros((2, N_TILES), dtype=bool))
+NO_FACES = Faces(*np.zeros((3, N_TILES), dtype=bool))
 
 
 def candidates_on(height, ranges, n_segments=180, seed=0, share=1.0, spread=0.3):
@@ -61,11 +61,13 @@ def test_backends_find_one_relief(compiled_code, seed, n_segments, looks_aside):
 
     ranges = np.sort(rng.uniform(2.0, 65.0, 24))
     candidates = candidates_on(terrain, ranges, n_segments, seed, share=0.7)
-    faces = Faces(*(rng.uniform(size=(2, N_TILES)) < 0.1))
+    faces = Faces(*(rng.uniform(size=(3, N_TILES)) < 0.1))
     config = Config().replace(**{'surface.look_aside': looks_aside})
     found = [backend.find_relief(candidates, faces, HEIGHT, config) for backend in BACKENDS]
     np.testing.assert_allclose(found[0][0].pieces, found[1][0].pieces, rtol=1e-7, atol=1e-7)
-    for relief, over in found:
+    for ours, theirs in zip(found[0][2], found[1][2], strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    for relief, over, _ in found:
         lift = relief.at(candidates.x, candidates.y)
         np.testing.assert_allclose(over.z, candidates.z - lift, rtol=1e-7, atol=1e-7)
         for ours, theirs in zip(over._replace(z=0), candidates._replace(z=0), strict=True):
@@ -85,7 +87,7 @@ def test_the_relief_is_that_of_a_bank(backend, degrees):
         return side * bank(abs(degrees), 10.0)(x, y)
 
     candidates = candidates_on(terrain, RINGS)
-    relief, over = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
+    relief, over, _ = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
     missed = over.z + HEIGHT
     assert np.abs(candidates.z + HEIGHT).max() == pytest.approx(3.0)
     assert np.mean(np.abs(missed) < 0.3) > 0.92
@@ -102,7 +104,7 @@ def test_terrain_ends_at_an_edge_and_goes_on_below(backend, at, depth):
     candidates = candidates_on(lambda x, y: np.where(x > at, -depth, 0.0), RINGS)
     seen = at * (HEIGHT + depth) / HEIGHT
     candidates = candidates.where((candidates.x < at) | (candidates.x > seen))
-    _, over = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
+    _, over, _ = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
     is_below = candidates.x > seen
     assert is_below.sum() > 150
     np.testing.assert_allclose(over.z[~is_below] + HEIGHT, 0.0, atol=0.01)
@@ -132,7 +134,7 @@ LEVEL_TERRAIN = {
 @pytest.mark.parametrize('share', [1.0, 0.5])
 def test_no_relief_is_what_cannot_be_climbed(backend, name, share):
     candidates = candidates_on(LEVEL_TERRAIN[name], RINGS, share=share)
-    relief, over = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
+    relief, over, _ = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
     assert relief.is_level
     assert over is candidates
     assert (relief.at(np.array([0.0, 9.0]), np.array([0.0, 3.0])) == 0.0).all()

@@ -46,7 +46,7 @@ from gp_ground_seg.core.pipeline.labels import (
 from gp_ground_seg.core.pipeline.lines import find_lines, trace
 from gp_ground_seg.core.pipeline.points import in_columns
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
-from gp_ground_seg.core.pipeline.relief import Relief
+from gp_ground_seg.core.pipeline.relief import Relief, with_standing
 
 
 class NumbaBackend:
@@ -84,15 +84,15 @@ class NumbaBackend:
 
     def find_relief(
         self, candidates: Candidates, faces: Faces, height: float, config: Config
-    ) -> tuple[Relief, Candidates]:
-        """Relief of the terrain, and the candidates over it."""
-        growth = numbers_of(config.growth)
+    ) -> tuple[Relief, Candidates, Faces]:
+        """Relief of the terrain, the candidates over it, and faces with what stands on it."""
         relief, z = Relief.level(), np.empty_like(candidates.z)
-        if not config.surface.look_aside or relief_.find_relief(
-            candidates, faces.is_face, height, growth, relief.pieces, z
-        ):
-            return relief, candidates
-        return relief, candidates._replace(z=z)
+        if not config.surface.look_aside:
+            return relief, candidates, faces
+        growth, stands = numbers_of(config.growth), np.zeros(len(z), dtype=np.bool_)
+        is_level = relief_.find_relief(candidates, faces, height, growth, relief.pieces, z, stands)
+        over = candidates if is_level else candidates._replace(z=z)
+        return relief, over, with_standing(faces, candidates.tile, stands)
 
     def learn_frame(self, frame: Frame, config: Config) -> Learned:
         """Hyper-parameters of the frame."""

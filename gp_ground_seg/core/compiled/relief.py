@@ -14,6 +14,7 @@ from gp_ground_seg.core.frame import (
     BoolArray,
     Candidates,
     CellArray,
+    Faces,
     FloatArray,
     IntArray,
     PointArray,
@@ -22,11 +23,9 @@ from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig
 from gp_ground_seg.core.pipeline.relief import (
     FADED,
-    GENTLE,
     MIN_ENTRY,
     MIN_SEEDS,
     MIN_WEIGHT,
-    MIN_WIDTH,
     N_ASIDE,
     N_ROUNDS,
     N_SIDES,
@@ -41,7 +40,9 @@ from gp_ground_seg.core.pipeline.relief import (
     goes_on,
     height_in,
     height_of,
+    is_gentle,
     largest_gap,
+    least_width,
     longest_gap,
     middle_of,
     piece_of,
@@ -58,17 +59,18 @@ _N_SUMS = 9
 @jit(entry=True)
 def find_relief(
     candidates: Candidates,
-    is_face: BoolArray,
+    faces: Faces,
     height: float,
     growth: GrowthConfig,
     pieces: FloatArray,
     z: FloatArray,
+    stands: BoolArray,
 ) -> bool:
     """Set the pieces of the relief, and heights of candidates over it; return whether it is level.
 
-    Where it is, nothing is set.
+    Where it is, they are not set. `stands` (C,) becomes true of what stands on the ground.
     """
-    before, behind = reachable(candidates, is_face, height, growth)
+    before, behind = reachable(candidates, faces, height, growth, stands)
     terrain, is_known = _fit_planes(candidates, before, height)
     below, is_known_below = terrain, np.zeros(_N_SQUARES, np.bool_)
     if behind.any():
@@ -282,29 +284,36 @@ class _Walk(NamedTuple):
     parent: IntArray  # (C,) a tree for each group of candidates that steps join
     is_raised: BoolArray  # (C,) candidates that are raised
     part: IntArray  # (C,) as `parent`, by steps between raised candidates alone
-    is_entry: BoolArray  # (C,) raised candidates that a step from one that is not leads to
+    is_foot: BoolArray  # (C,) raised candidates with a neighbour that is not
+    is_entry: BoolArray  # (C,) those that a step from it leads to
     is_fallen: BoolArray  # (C,) candidates that a fall leads to
 
 
 @jit()
 def reachable(
-    candidates: Candidates, is_face: BoolArray, height: float, growth: GrowthConfig
+    candidates: Candidates,
+    faces: Faces,
+    height: float,
+    growth: GrowthConfig,
+    stands: BoolArray,
 ) -> tuple[BoolArray, BoolArray]:
-    """See the plain `reachable`."""
+    """See the plain `reachable`, of which the third result is `stands`, to be set."""
     r, n = candidates.r, len(candidates.r)
-    allowed, is_raised = np.empty(n, np.bool_), np.empty(n, np.bool_)
-    is_entry, is_fallen = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    allowed, is_steep = np.empty(n, np.bool_), np.empty(n, np.bool_)
     for c in range(n):
-        allowed[c] = r[c] < REACH and not is_face[np.uintp(candidates.tile[c])]
-        is_raised[c] = candidates.z[c] + height > RAISED
-    walk = _Walk(np.arange(n), is_raised, np.arange(n), is_entry, is_fallen)
-    steep, down = _step_along(candidates, allowed, walk)
+        tile = np.uintp(candidates.tile[c])
+        allowed[c], is_steep[c] = r[c] < REACH and not faces.is_face[tile], faces.is_steep[tile]
+    marks = np.zeros((4, n), np.bool_)
+    walk = _Walk(np.arange(n), marks[0], np.arange(n), marks[1], marks[2], marks[3])
+    for c in range(n):
+        walk.is_raised[c] = candidates.z[c] + height > RAISED
+    steep, down = _step_along(candidates, allowed, is_steep, walk)
     for aside in range(1, N_ASIDE + 1):
-        _step_aside(candidates, allowed, aside, walk)
-    _step_in_front(candidates, steep, walk)
-    _step_in_front(candidates, down, walk)
+        _step_aside(candidates, allowed, is_steep, aside, walk)
+    _step_in_front(candidates, steep, is_steep, walk)
+    _step_in_front(candidates, down, is_steep, walk)
     is_terrain = allowed.copy()
-    _leave_out_not_entered(candidates, walk, is_terrain)
+    _leave_out_not_entered(candidates, walk, is_terrain, stands)
     parent, n_seeds = walk.parent, np.zeros(n, np.int64)
     for c in range(n):
         if walk.is_fallen[c] and is_terrain[c] and is_terrain[c - 1]:
@@ -343,32 +352,63 @@ def _step(walk: _Walk, a: int, b: int) -> None:
     _join(walk.parent, a, b)
     if walk.is_raised[a] and walk.is_raised[b]:
         _join(walk.part, a, b)
-    elif walk.is_raised[a]:
-        walk.is_entry[a] = True
-    elif walk.is_raised[b]:
-        walk.is_entry[b] = True
+    else:
+        _mark_raised(walk.is_raised, a, b, walk.is_entry)
 
 
 @jit()
-def _leave_out_not_entered(candidates: Candidates, walk: _Walk, reached: BoolArray) -> None:
+def _mark_raised(is_raised: BoolArray, a: int, b: int, marks: BoolArray) -> None:
+    """Mark the one of two candidates that is raised, if the other is not."""
+    marks[a] |= is_raised[a] and not is_raised[b]
+    marks[b] |= is_raised[b] and not is_raised[a]
+
+
+@jit()
+def _leave_out_not_entered(
+    candidates: Candidates, walk: _Walk, is_terrain: BoolArray, stands: BoolArray
+) -> None:
     """See the plain `_entered`. A part of raised terrain is reached as a whole, or not at all."""
-    r, n, offsets = candidates.r, len(reached), candidates.offsets
-    width, last = np.zeros(n), np.zeros(n, np.int64)
+    offsets, is_before = candidates.offsets, np.zeros(len(is_terrain), np.bool_)
+    for m in range(len(offsets) - 1):
+        sees_lower = False
+        for c in range(offsets[m + 1] - 1, offsets[m] - 1, -1):
+            is_before[c] = sees_lower and is_terrain[c] and walk.is_raised[c]
+            sees_lower |= is_terrain[c] and not walk.is_raised[c]
+    entry, foot, before = (
+        _widths(candidates, walk.part, walk.is_entry),
+        _widths(candidates, walk.part, walk.is_foot),
+        _widths(candidates, walk.part, is_before),
+    )
+    for c in range(len(is_terrain)):
+        if is_terrain[c] and walk.is_raised[c]:
+            part = _root(walk.part, c)
+            is_terrain[c] = entry[part] >= MIN_ENTRY
+            has_foot = min(foot[part], before[part]) >= MIN_ENTRY
+            stands[c] = has_foot and not is_terrain[c]
+
+
+@jit()
+def _widths(candidates: Candidates, part: IntArray, marked: BoolArray) -> FloatArray:
+    """Width of the segments with a `marked` candidate, by the nearest one, at the root of a part.
+
+    (C,), in m.
+    """
+    r, offsets = candidates.r, candidates.offsets
+    width, last = np.zeros(len(r)), np.zeros(len(r), np.int64)
     for m in range(len(offsets) - 1):
         for c in range(offsets[m], offsets[m + 1]):
-            if walk.is_entry[c]:
-                part = _root(walk.part, c)
+            if marked[c]:
+                root = _root(part, c)
                 # One more than the segment, as 0 is none.
-                if last[part] != m + 1:
-                    width[part] += arc_of(r[c], len(offsets) - 1)
-                    last[part] = m + 1
-    for c in range(n):
-        reached[c] &= not walk.is_raised[c] or width[_root(walk.part, c)] >= MIN_ENTRY
+                if last[root] != m + 1:
+                    width[root] += arc_of(r[c], len(offsets) - 1)
+                    last[root] = m + 1
+    return width
 
 
 @jit()
 def _step_along(
-    candidates: Candidates, allowed: BoolArray, walk: _Walk
+    candidates: Candidates, allowed: BoolArray, is_steep: BoolArray, walk: _Walk
 ) -> tuple[IntArray, IntArray]:
     """Step between neighbours of a segment.
 
@@ -386,10 +426,13 @@ def _step_along(
             if dr > largest_gap(r[c]):
                 is_taken = dr <= longest_gap(r[c]) and _goes_on(candidates, offsets[m], c)
             else:
-                is_taken = can_step(dr, rise, STEEP)
-                if is_taken and abs(rise) <= GENTLE:
+                over_steep, is_taken = is_steep[c - 1] or is_steep[c], can_step(dr, rise, STEEP)
+                if is_taken and is_gentle(rise, over_steep):
                     _step(walk, c - 1, c)
                     continue
+                is_sheer = over_steep or not can_step(dr, rise, math.inf)
+                if is_sheer and (is_taken or not falls(dr, rise)):
+                    _mark_raised(walk.is_raised, c - 1, c, walk.is_foot)
             walk.is_fallen[c] = not is_taken and falls(dr, rise)
             if is_taken:
                 steep[n] = c
@@ -414,7 +457,9 @@ def _goes_on(candidates: Candidates, first: int, c: int) -> bool:
 
 
 @jit()
-def _step_in_front(candidates: Candidates, steep: IntArray, walk: _Walk) -> None:
+def _step_in_front(
+    candidates: Candidates, steep: IntArray, is_steep: BoolArray, walk: _Walk
+) -> None:
     """Take the steep and long steps in a front; `steep` (S,) are their far ends, in order.
 
     Falls that are not in one are none.
@@ -437,7 +482,8 @@ def _step_in_front(candidates: Candidates, steep: IntArray, walk: _Walk) -> None
         front[k] = _root(front, k)
         width[front[k]] += arc_of(candidates.r[steep[k] - 1], n_segments)
     for k in range(len(steep)):
-        is_wide = width[front[k]] >= MIN_WIDTH
+        over_steep = is_steep[steep[k] - 1] or is_steep[steep[k]]
+        is_wide = width[front[k]] >= least_width(over_steep)
         if walk.is_fallen[steep[k]]:
             walk.is_fallen[steep[k]] = is_wide
         elif is_wide:
@@ -461,7 +507,9 @@ def _join_front(
 
 
 @jit()
-def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, walk: _Walk) -> None:
+def _step_aside(
+    candidates: Candidates, allowed: BoolArray, is_steep: BoolArray, aside: int, walk: _Walk
+) -> None:
     """Step from each candidate to the next ones in range of the segment so many further on."""
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     n_segments = len(offsets) - 1
@@ -483,8 +531,12 @@ def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, walk: _W
                     continue
                 if allowed[there] and dr <= gap:
                     distance = math.sqrt(dr * dr + across * across)
-                    if can_step(distance, z[there] - z[c], GENTLE):
+                    rise, over_steep = z[there] - z[c], is_steep[c] or is_steep[there]
+                    can_be = can_step(distance, rise, math.inf)
+                    if can_be and is_gentle(rise, over_steep):
                         _step(walk, c, there)
+                    elif over_steep or not can_be:
+                        _mark_raised(walk.is_raised, c, there, walk.is_foot)
 
 
 @jit()

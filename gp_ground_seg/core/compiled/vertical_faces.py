@@ -26,6 +26,7 @@ from gp_ground_seg.core.pipeline.vertical_faces import (
     is_base_occluded,
     is_beyond_edge,
     is_examined,
+    is_steep,
     is_vertical,
     scatter_square,
     smooth_up_to,
@@ -56,6 +57,7 @@ def find_faces(
         reaches = max(low[_TOP], high[_TOP]) > face_height(label)
         is_face = reaches and is_vertical(low, high, config)
         faces.is_face[np.uintp(tall[k])] = is_face
+        faces.is_steep[np.uintp(tall[k])] = reaches and is_steep(high)
         is_occluded = is_face and is_base_occluded(low, high, config)
         faces.has_occluded_base[np.uintp(tall[k])] = is_occluded
         square[k] = UNKNOWN if is_face else scatter_square(low, high)

@@ -19,13 +19,14 @@ import numpy.typing as npt
 from gp_ground_seg.core.frame import (
     BoolArray,
     Candidates,
+    CellArray,
     Faces,
     FloatArray,
     IntArray,
     PointArray,
     Values,
 )
-from gp_ground_seg.core.jit import shared
+from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config
 
 REACH = 60.0
@@ -62,8 +63,8 @@ RIDGE = 0.5
 MIN_WEIGHT = 1.5
 """Least weight of a plane, where a square with candidates counts one."""
 RAISED, MIN_ENTRY = 0.3, 1.5
-"""Height from which terrain is raised [m]; width over which steps must lead up to it [m]: few lead
-to a car."""
+"""Height from which terrain is raised [m]; width over which steps must lead up to it [m], as few
+lead to a car. What has a foot so wide, and fewer steps, stands on the ground."""
 FADED, FADE_WIDTH = 0.15, 0.3
 """Height of the terrain up to which the relief is level [m]; within this much more it grows to it
 [m]."""
@@ -109,28 +110,43 @@ class Relief(NamedTuple):
 
 def find_relief(
     candidates: Candidates, faces: Faces, height: float, config: Config
-) -> tuple[Relief, Candidates]:
+) -> tuple[Relief, Candidates, Faces]:
     """Relief over a plane `height` [m] below the origin, and the candidates over the relief.
 
     Vertical faces are no terrain. What is behind a fall has a relief of its own, so that the
-    relief before it is flat up to the edge.
+    relief before it is flat up to the edge. The third is `faces` with what stands on the ground.
     """
     if not config.surface.look_aside:
-        return Relief.level(), candidates
+        return Relief.level(), candidates, faces
     growth, over_plane = config.growth, candidates._replace(z=candidates.z + height)
     allowed = ~faces.is_face[candidates.tile] & (candidates.r < REACH)
     is_seed = allowed & (candidates.r < growth.seed_range)
     is_seed &= np.abs(over_plane.z) < growth.seed_height_tolerance
-    sides = [over_plane.where(side) for side in reachable(over_plane, allowed, is_seed)]
+    is_steep = faces.is_steep[candidates.tile]
+    *reached, stands = reachable(over_plane, allowed, is_steep, is_seed)
+    faces = with_standing(faces, candidates.tile, stands)
+    sides = [over_plane.where(side) for side in reached]
     terrains = [fit_planes(side.x, side.y, side.z) for side in sides if len(side.r)]
     if not any((np.abs(terrain[is_known]) > FADED).any() for terrain, is_known in terrains):
-        return Relief.level(), candidates
+        return Relief.level(), candidates, faces
     relief = Relief.of(faded(filled(*terrains[0])))
     if len(terrains) == 2 and terrains[1][1].any():
         behind = Relief.of(faded(filled(*terrains[1])))
         is_behind = _is_behind(sides, terrains)[..., None]
         relief = Relief(np.where(is_behind, behind.pieces, relief.pieces))
-    return relief, candidates._replace(z=candidates.z - relief.at(candidates.x, candidates.y))
+    z = candidates.z - relief.at(candidates.x, candidates.y)
+    return relief, candidates._replace(z=z), faces
+
+
+def with_standing(faces: Faces, tile: CellArray, stands: BoolArray) -> Faces:
+    """Faces, and tiles of which all candidates stand on the ground.
+
+    `tile` and `stands` (C,) are of the candidates.
+    """
+    is_face = np.zeros_like(faces.is_face)
+    is_face[tile[stands]] = True
+    is_face[tile[~stands]] = False
+    return faces._replace(is_face=faces.is_face | is_face)
 
 
 def _is_behind(sides: list[Candidates], terrains: list[tuple[FloatArray, BoolArray]]) -> BoolArray:
@@ -156,31 +172,31 @@ def _is_behind(sides: list[Candidates], terrains: list[tuple[FloatArray, BoolArr
 
 
 def reachable(
-    candidates: Candidates, allowed: BoolArray, is_seed: BoolArray
-) -> tuple[BoolArray, BoolArray]:
+    candidates: Candidates, allowed: BoolArray, is_steep: BoolArray, is_seed: BoolArray
+) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Which of the candidates can be reached from enough seeds in steps over `allowed` ones.
 
     Gentle steps are taken in any case, steep and long ones where they form a front, side by side:
-    those to a car are few. A front may mix falls and steps down. A fall counts from terrain only:
-    what is seen over a hedge is below its top. Heights of the candidates are over the plane near
-    the sensor.
+    those to a car are few. None leads up or down beside returns that are too steep (`is_steep`).
+    A front may mix falls and steps down. A fall counts from terrain only: what is seen over a
+    hedge is below its top. Heights of the candidates are over the plane near the sensor.
 
-    Returns those before falls in their segment, and those behind and below one, two (C,): across a
-    ditch the terrain is that before it.
+    Returns those before falls in their segment, those behind and below one, and those that stand
+    on the ground, see `_entered`, three (C,): across a ditch the terrain is that before it.
     """
-    first, second, is_fall = _steps(candidates)
-    taken = allowed[first] & allowed[second]
-    first, second, is_fall = first[taken], second[taken], is_fall[taken]
-    is_along = second == first + 1
-    taken = np.abs(candidates.z[second] - candidates.z[first]) <= GENTLE
-    dr = candidates.r[second] - candidates.r[first]
-    taken &= ~is_along | (dr <= largest_gap(candidates.r[second]))
-    wanting = np.flatnonzero(~taken)
-    leads_down = candidates.z[second] < candidates.z[first]
-    for wanted in (wanting[~is_fall[wanting]], wanting[leads_down[wanting]]):
-        taken[wanted] |= _in_front(candidates, first[wanted])
-    is_way_up = taken & ~is_fall
-    is_terrain = _entered(candidates, allowed, first[is_way_up], second[is_way_up])
+    steps = _steps(candidates)
+    steps = steps.where(allowed[steps.first] & allowed[steps.second])
+    first, second, is_fall = steps.first, steps.second, steps.is_fall
+    rise = candidates.z[second] - candidates.z[first]
+    over_steep, is_near = is_steep[first] | is_steep[second], ~steps.is_long & ~is_fall
+    can_be = is_near & can_step(steps.length, rise, math.inf)
+    taken = can_be & is_gentle(rise, over_steep)
+    is_sheer = is_near & ~taken & (over_steep | ~can_be)
+    is_steep_step = steps.is_long | (can_be & (second == first + 1) & (np.abs(rise) <= STEEP))
+    is_steep_step &= ~taken
+    for wanted in (is_steep_step, is_fall | (is_steep_step & (rise < 0.0))):
+        taken[wanted] |= _in_front(candidates, first[wanted], over_steep[wanted])
+    is_terrain, stands = _entered(candidates, allowed, steps, taken & ~is_fall, is_sheer)
     taken &= ~is_fall | (is_terrain[first] & is_terrain[second])
     group = _groups(len(allowed), first[taken], second[taken])
     is_reached = (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
@@ -191,37 +207,57 @@ def reachable(
     edge = np.append(0, np.flatnonzero(is_fallen))[number] - 1
     is_behind = number > np.append(0, number)[candidates.offsets][candidates.segment]
     is_behind &= candidates.z < candidates.z[edge] - STEEP
-    return is_terrain & is_reached & ~is_behind, is_terrain & is_reached & is_behind
+    is_reached &= is_terrain
+    return is_reached & ~is_behind, is_reached & is_behind, stands
 
 
 def _entered(
-    candidates: Candidates, allowed: BoolArray, first: IntArray, second: IntArray
-) -> BoolArray:
-    """Candidates that are `allowed`, without raised ones that few of the steps lead up to, (C,).
+    candidates: Candidates,
+    allowed: BoolArray,
+    steps: _Steps,
+    taken: BoolArray,
+    is_sheer: BoolArray,
+) -> tuple[BoolArray, BoolArray]:
+    """Candidates that may be terrain, and those that stand on the ground, two (C,).
 
-    `first` and `second` (S,) are the ends of the steps. A hillside is entered all along its foot,
-    a car, if at all, where the step to a sill or a bonnet happens to be gentle.
+    Steps (S,) are `taken`, or too steep, `is_sheer`. A hillside is entered all along its foot, a
+    car, if at all, where the step to a sill or a bonnet happens to be gentle. Raised candidates
+    that few steps lead up to are no terrain. They stand on the ground if it is seen before them,
+    where they are sheer, and behind them. What is behind a wall, up to where nothing is seen, may
+    be the upper one of two levels.
     """
+    first, second = steps.first, steps.second
     is_raised, n_segments = allowed & (candidates.z > RAISED), len(candidates.offsets) - 1
-    both = is_raised[first] & is_raised[second]
+    both = is_raised[first] & is_raised[second] & taken
     part = _groups(len(allowed), first[both], second[both])
+
+    def is_wide(entries: IntArray) -> BoolArray:
+        entries = np.unique(entries)
+        # A segment with several entries counts once, by the nearest.
+        key = part[entries] * n_segments + candidates.segment[entries]
+        nearest = entries[np.unique(key, return_index=True)[1]]
+        arcs = arc_of(candidates.r[nearest], n_segments)
+        result: BoolArray = np.bincount(part[nearest], arcs, len(allowed))[part] >= MIN_ENTRY
+        return result
+
+    upper = np.where(is_raised[first], first, second)
     leads_up = is_raised[first] != is_raised[second]
-    entries = np.unique(np.where(is_raised[first], first, second)[leads_up])
-    # A segment with several entries counts once, by the nearest.
-    key = part[entries] * n_segments + candidates.segment[entries]
-    nearest = entries[np.unique(key, return_index=True)[1]]
-    arcs = arc_of(candidates.r[nearest], n_segments)
-    width = np.bincount(part[nearest], arcs, minlength=len(allowed))
-    result: BoolArray = allowed & (~is_raised | (width[part] >= MIN_ENTRY))
-    return result
+    is_entered = is_wide(upper[leads_up & taken])
+    low, last = np.flatnonzero(allowed & ~is_raised), np.full(n_segments, -1)
+    last[candidates.segment[low]] = low
+    is_before_low = is_raised & (np.arange(len(allowed)) < last[candidates.segment])
+    stands = is_raised & ~is_entered
+    stands &= is_wide(upper[leads_up & is_sheer]) & is_wide(np.flatnonzero(is_before_low))
+    return allowed & (~is_raised | is_entered), stands
 
 
-def _in_front(candidates: Candidates, near: IntArray) -> BoolArray:
+def _in_front(candidates: Candidates, near: IntArray, over_steep: BoolArray) -> BoolArray:
     """Which steep steps, from the candidates `near` (S,) to the next, are in a front, (S,).
 
-    Two steps are side by side if they are in segments at most `N_ASIDE` apart and overlap in range
-    and in height: of a segment, the first that ends no nearer than the other begins, or the one
-    behind it.
+    Such a front is wider where they are `over_steep` (S,) returns, see `least_width`. Two steps
+    are side by side if they are in segments at most `N_ASIDE` apart and overlap in range and in
+    height: of a segment, the first that ends no nearer than the other begins, or the one behind
+    it.
     """
     n_segments, segment = len(candidates.offsets) - 1, candidates.segment[near]
     r, z = candidates.r, candidates.z
@@ -239,7 +275,7 @@ def _in_front(candidates: Candidates, near: IntArray) -> BoolArray:
             pairs.append(np.stack([np.arange(n), other])[:, is_beside])
     front = _groups(n, *np.concatenate(pairs, axis=1))
     width = np.bincount(front, arc_of(begin, n_segments))
-    result: BoolArray = width[front] >= MIN_WIDTH
+    result: BoolArray = width[front] >= least_width(over_steep)
     return result
 
 
@@ -253,41 +289,56 @@ def _groups(n: int, first: IntArray, second: IntArray) -> IntArray:
     return group
 
 
-def _steps(candidates: Candidates) -> tuple[IntArray, IntArray, BoolArray]:
-    """Candidates at both ends of all possible steps, and which of them are falls.
+class _Steps(NamedTuple):
+    """Steps between neighbours among the candidates, which may be too steep."""
 
-    They lead to the next candidate of the segment, and to the two in range next to it in each
-    segment beside; there none is steep or long. A long step is compared with the slope from the
-    last candidate that is half of it before it.
+    first: IntArray  # (S,) candidates at the near end, and
+    second: IntArray  # (S,) at the other one
+    length: FloatArray  # (S,) m
+    is_long: BoolArray  # (S,) longer than `largest_gap`, with the slope of the terrain before it
+    is_fall: BoolArray  # (S,) see `falls`
+
+    def where(self, kept: BoolArray) -> _Steps:
+        """Those `kept`, (S,)."""
+        columns: Any = (column[kept] for column in self)
+        return _Steps(*columns)
+
+
+def _steps(candidates: Candidates) -> _Steps:
+    """List the steps to the next candidate of a segment, and to those in the segments beside.
+
+    These are the two next to it in range; there no step is long, and none a fall. The slope before
+    a long step is that from the last candidate that is half of it before it.
     """
     r, z, segment = candidates.r, candidates.z, candidates.segment
     n_segments, n = len(candidates.offsets) - 1, len(r)
     apart = 2.0 * float(r.max(initial=0.0)) + 1.0  # of one segment's ranges and the next one's
     key, here = segment * apart + r, np.arange(n)
-    along, dr, rise = here[:-1], np.diff(r), np.diff(z)
+    dr, rise = np.diff(r), np.diff(z)
     before = np.searchsorted(key, key[:-1] - 0.5 * dr, side='right') - 1
     has_before = (before >= 0) & (segment[before] == segment[:-1])
+    is_far, can_be = dr > largest_gap(r[1:]), can_step(dr, rise, STEEP)
     with np.errstate(divide='ignore', invalid='ignore'):
         slope_before = (z[:-1] - z[before]) / (r[:-1] - r[before])
         is_long = has_before & (dr <= longest_gap(r[1:])) & goes_on(rise / dr, slope_before)
-    is_step = (dr <= largest_gap(r[1:])) & can_step(dr, rise, STEEP)
-    is_step |= is_long & (dr > largest_gap(r[1:]))
-    is_fall = ~is_step & falls(dr, rise)
-    is_step = (is_step | is_fall) & (segment[1:] == segment[:-1])
-    first, second, is_fall = [along[is_step]], [along[is_step] + 1], is_fall[is_step]
+    is_long &= is_far
+    is_fall = ~is_long & (is_far | ~can_be) & falls(dr, rise)
+    along = np.flatnonzero((~is_far | is_long | is_fall) & (segment[1:] == segment[:-1]))
+    first, second, length = [along], [along + 1], [dr[along]]
     for aside in range(1, N_ASIDE + 1):
         beside = (segment + aside) % n_segments
         behind = np.searchsorted(key, beside * apart + r)
         across = aside * arc_of(r, n_segments)
         for there in (behind - 1, np.minimum(behind, n - 1)):
             dr = np.abs(r[there] - r)
-            is_step = (segment[there] == beside) & (dr <= 0.5 * largest_gap(r))
-            distance = np.sqrt(dr * dr + across * across)
-            is_step &= can_step(distance, z[there] - z, GENTLE)
-            first.append(here[is_step])
-            second.append(there[is_step])
-    near, far = np.concatenate(first), np.concatenate(second)
-    return near, far, np.pad(is_fall, (0, len(near) - len(is_fall)))
+            is_near = (segment[there] == beside) & (dr <= 0.5 * largest_gap(r))
+            first.append(here[is_near])
+            second.append(there[is_near])
+            length.append(np.sqrt(dr * dr + across * across)[is_near])
+    near = np.concatenate(first)
+    n_aside = len(near) - len(along)
+    is_long, is_fall = (np.pad(kind[along], (0, n_aside)) for kind in (is_long, is_fall))
+    return _Steps(near, np.concatenate(second), np.concatenate(length), is_long, is_fall)
 
 
 @shared
@@ -329,6 +380,21 @@ def arc_of(r: Values, n_segments: int) -> Values:
 def can_step(distance: Values, rise: Values, most: float) -> Values:
     """Whether a step of this length and rise [m] is one on foot."""
     return np.abs(rise) <= np.minimum(MAX_SLOPE * distance + STEP_TOLERANCE, most)
+
+
+@shared
+def is_gentle(rise: Values, over_steep: Values) -> Values:
+    """Whether a step may be taken anywhere.
+
+    Where the returns about it are too steep for terrain, it may only be as high as they scatter.
+    """
+    return np.abs(rise) <= choose(over_steep, STEP_TOLERANCE, GENTLE)
+
+
+@shared
+def least_width(over_steep: Values) -> Values:
+    """Width from which on a front is one of terrain [m]."""
+    return choose(over_steep, 2.0, 1.0) * MIN_WIDTH
 
 
 def fit_planes(x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -26,7 +26,7 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, FacesConfig, LabelConfig
-from gp_ground_seg.core.pipeline.relief import longest_gap
+from gp_ground_seg.core.pipeline.relief import MAX_SLOPE, longest_gap
 from gp_ground_seg.core.pipeline.roughness import (
     N_LEVELS,
     ROUGHNESS,
@@ -78,8 +78,7 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     # Most returns are in tiles where nothing stands, and are left out.
     extent, over = highest_z - lowest_z, lowest_z + height
     tall = np.flatnonzero(is_examined(extent, over, tiles.place, label))
-    extent, over = extent[tall], over[tall]
-    lowest_z = lowest_z[tall]
+    extent, over, lowest_z = extent[tall], over[tall], lowest_z[tall]
     # One more than there are tiles: `OUTSIDE` is the index of the last.
     row_of_tile = np.full(len(result.is_face), OUTSIDE)
     row_of_tile[tall] = np.arange(len(tall))
@@ -102,6 +101,7 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     reaches = np.zeros(len(tall), dtype=np.bool_)
     reaches[row[above > face_height(label)]] = True
     result.is_face[tall] = reaches & is_vertical(foot, rest, faces)
+    result.is_steep[tall] = reaches & is_steep(rest)
     result.has_occluded_base[tall] = result.is_face[tall] & is_base_occluded(foot, rest, faces)
     square = np.where(result.is_face[tall], UNKNOWN, scatter_square(foot, rest))
     rough = tall[_scattered(tiles.place[tall], n_sides, square, extent, over, label)]
@@ -209,6 +209,19 @@ def is_vertical(foot: FloatArray, rest: FloatArray, faces: FacesConfig) -> Value
     """Whether the returns of a tile form a vertical face; for the sums see `moments`."""
     n, xx, yy, zz, xy, xz, yz = moments(foot, rest)
     return (n >= MIN_RETURNS) & (normal_z(xx, yy, zz, xy, xz, yz) < faces.max_normal_z)
+
+
+@shared
+def is_steep(rest: FloatArray) -> Values:
+    """Whether the returns above the lowest of a tile rise more steeply than terrain.
+
+    How far they lie on for each metre of height is a regression of x and y on z: foliage, and
+    noise of the ranges, scatter these, and change it little. For the sums see `moments`.
+    """
+    n = np.maximum(rest[0], 1.0)
+    zz = rest[6] - rest[3] * rest[3] / n
+    xz, yz = rest[8] - rest[1] * rest[3] / n, rest[9] - rest[2] * rest[3] / n
+    return (rest[0] >= MIN_RETURNS) & (MAX_SLOPE * MAX_SLOPE * (xz * xz + yz * yz) < zz * zz)
 
 
 @shared
