@@ -84,5 +84,4 @@ def partly_compiled(*stages: str) -> Backend:
 
 
 def _warn_slow(reason: str, more: object) -> None:
-    text = 'numba %s: using numpy, several times slower (%s)'
-    log_once(logging.WARNING, text, reason, more)
+    log_once(logging.WARNING, 'numba %s: using numpy, several times slower (%s)', reason, more)

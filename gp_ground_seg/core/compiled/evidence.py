@@ -42,25 +42,21 @@ def estimate_surface(
     and the rule of the labels by the parameters, `uses_neighbours` is `uses_neighbours_in`.
     """
     knots, (n_segments, n_knots) = frame.knots, by_itself.mean.shape
-    own, nothing = np.empty((2, n_segments, n_knots)), np.empty((2, 0, 0))
-    table = np.empty((2, n_segments, n_knots))
+    own, table = np.empty((2, n_segments, n_knots)), np.empty((2, n_segments, n_knots))
     u, knot_u = by_itself.log_length_scale, by_itself.knot_log_length_scale
     if is_latent:
         latent_log_length_scales(frame, given, 1, u, knot_u)
     max_slope = CLEARLY * observation.slope_std if uses_neighbours else -1.0
     odds = _find_seeds(frame, given, growth, max_slope, own[0], by_itself.seed)
     odds = odds if by_roughness else 0.0
-    from_neighbours = nothing
+    from_neighbours = np.empty((2, 0, 0))
     if uses_neighbours:
-        grow_inliers(frame, given, observation, growth, odds, nothing, STEP, by_itself)
+        grow_inliers(frame, given, observation, growth, odds, from_neighbours, STEP, by_itself)
         regress(frame, given, observation, STEP, by_itself)
         _find_evidence(by_itself, given, knots, observation, own, table)
         from_neighbours = table
     grow_inliers(frame, given, observation, growth, odds, from_neighbours, 1, by_itself)
-    is_changed = False
-    for i in range(2, len(theta)):
-        is_changed |= theta[i] != given[i]
-    if is_latent and is_changed:
+    if is_latent and (theta[2:] != given[2:]).any():
         latent_log_length_scales(frame, theta, 1, u, knot_u)
     regress(frame, theta, observation, 1, by_itself)
     if uses_neighbours:
@@ -148,11 +144,9 @@ def _find_evidence(
     own_evidence: FloatArray,
     from_neighbours: FloatArray,
 ) -> None:
-    """Do what `evidence_of_neighbours` of the twin does.
+    """Do what `evidence_of_neighbours` of the twin does, into `from_neighbours` (2, M, K).
 
-    Into `from_neighbours` (2, M, K): height and precision.
-
-    `own_evidence` (2, M, K) is overwritten.
+    These are height and precision. `own_evidence` (2, M, K) is overwritten.
     """
     n_segments, n_knots = by_itself.mean.shape
     # Unsigned, as a signed index could count from the end.
@@ -208,14 +202,9 @@ def _combine(
     sill, mean, std = math.exp(theta[0]) ** 2, by_itself.mean, by_itself.std
     for m in range(len(mean)):
         for j in range(len(knots)):
-            if from_neighbours.shape[1] > 0 and not math.isnan(
-                by_itself.knot_log_length_scale[m, j]
-            ):
-                mean[m, j], std[m, j] = combined_surface(
-                    mean[m, j],
-                    std[m, j],
-                    prior_variance(sill, observation, knots[j]),
-                    from_neighbours[0, m, j],
-                    from_neighbours[1, m, j],
-                )
+            is_wanted = not math.isnan(by_itself.knot_log_length_scale[m, j])
+            if is_wanted and from_neighbours.shape[1] > 0:
+                prior = prior_variance(sill, observation, knots[j])
+                beside = from_neighbours[0, m, j], from_neighbours[1, m, j]
+                mean[m, j], std[m, j] = combined_surface(mean[m, j], std[m, j], prior, *beside)
             mean[m, j] += prior_mean

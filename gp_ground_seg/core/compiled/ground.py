@@ -17,6 +17,7 @@ from gp_ground_seg.core.compiled.numerics import LANES
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, IntArray
 from gp_ground_seg.core.gp.evidence import between_knots, combined, contradicts
 from gp_ground_seg.core.gp.ground import (
+    ROUNDING_SINGLE,
     carries_on,
     fits,
     noise_among,
@@ -32,10 +33,6 @@ from gp_ground_seg.core.gp.kernels import (
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
 from gp_ground_seg.core.pipeline.lines import is_walkable
-
-ROUNDING = 1e-6
-"""Least noise of what is observed, in parts of the largest prior variance: the rounding of single
-precision."""
 
 
 class SegmentSurfaces(NamedTuple):
@@ -86,7 +83,7 @@ def _prior_of(frame: Frame, theta: FloatArray, observation: ObservationConfig) -
     farthest = 0.0
     for c in range(len(frame.candidates.r)):
         farthest = max(farthest, frame.candidates.r[c])
-    noise = max(noise, ROUNDING * prior_variance(sill, observation, farthest))
+    noise = max(noise, ROUNDING_SINGLE * prior_variance(sill, observation, farthest))
     return _Prior(sill, slope, sixth, noise)
 
 

@@ -41,9 +41,8 @@ def learn_frame(
     at the candidates if these are given. Sets `outcome` (2,) to the objective and the place of the
     status in `STATUSES`, and returns the number of evaluations.
     """
-    step, nothing, has_latent = learning.segment_step, np.empty((2, 0, 0)), False
-    for i in range(2, len(theta)):
-        has_latent |= space.free[i]
+    step, nothing = learning.segment_step, np.empty((2, 0, 0))
+    has_latent = bool(space.free[2:].any())
     if is_latent:
         at_knots = by_itself.knot_log_length_scale
         latent_log_length_scales(frame, theta, step, by_itself.log_length_scale, at_knots)

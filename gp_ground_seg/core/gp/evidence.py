@@ -9,7 +9,6 @@ with a segment's own which candidates join.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -199,12 +198,9 @@ def _rise_around(table: FloatArray, rise: FloatArray) -> None:
             np.minimum(table, np.roll(table, shift, axis=0) + reach * rise, out=table)
 
 
-def _reaches(n_segments: int) -> Iterator[int]:
+def _reaches(n_segments: int) -> list[int]:
     """Segments that values move on by, in turn, to have come to all of the ring: 1, 2, 4, ..."""
-    reach = 1
-    while reach < n_segments:
-        yield reach
-        reach *= 2
+    return [2**k for k in range((n_segments - 1).bit_length())]
 
 
 def evidence_of_neighbours(

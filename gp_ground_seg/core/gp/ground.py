@@ -111,13 +111,9 @@ ODDS_IN_FACE = 4.0
 """Least obstacles for each ground among the candidates in vertical faces."""
 MOST_DOUBT = 30.0
 """Logarithm of odds that are as good as infinite."""
-
-
-ROUNDING = 1e-12
-"""Least noise of what is observed, in parts of the largest covariance: its rounding. With less, a
-predicted variance could be negative."""
-
-
+ROUNDING, ROUNDING_SINGLE = 1e-12, 1e-6
+"""Least noise of what is observed, in parts of the largest covariance: its rounding, in double and
+in single precision. With less, a predicted variance could be negative."""
 RISES_ON = 0.8
 """Part of the slope to a candidate with which the ground behind it must rise on."""
 
@@ -146,11 +142,11 @@ def variances_of(theta: Values) -> tuple[Values, Values]:
     return np.exp(2.0 * theta[0]), np.exp(2.0 * theta[1])
 
 
-def _variances(frame: Frame, theta: FloatArray, config: Config) -> tuple[Any, Any]:
-    """`variances_of` theta; that of the noise is more than the rounding of covariances."""
+def _variances(frame: Frame, theta: FloatArray, config: Config, least: float) -> tuple[Any, Any]:
+    """`variances_of` theta; that of the noise is at least the rounding of covariances."""
     sill, noise = variances_of(theta)
     farthest = frame.candidates.r.max(initial=0.0)
-    return sill, max(noise, ROUNDING * prior_variance(sill, config.observation, farthest))
+    return sill, max(noise, least * prior_variance(sill, config.observation, farthest))
 
 
 @shared
@@ -191,7 +187,7 @@ def posterior_covariance(
     u, knot_u = log_length_scales(frame, theta, config)
     r = np.concatenate([candidates.r[own], frame.knots[:n]])
     l = np.exp(np.concatenate([u[own], knot_u[m, :n]]))  # noqa: E741
-    sill, noise = _variances(frame, theta, config)
+    sill, noise = _variances(frame, theta, config, ROUNDING)
     prior = paciorek(r[:, None], l[:, None], r, l, sill)
     prior += line_covariance(r[:, None], r, *line_variances(config.observation))
     reach = np.exp(given_theta(config)[3]) if config.label.rule == 'roughness' else 0.0
@@ -245,7 +241,8 @@ def grow_inliers(
     """
     candidates, given = frame.candidates, given_theta(config)
     z = candidates.z - frame.prior_mean
-    sill, gate_noise = _variances(frame, given, config)
+    sill, gate_noise = _variances(frame, given, config, ROUNDING_SINGLE)
+    r, length_scale = candidates.r.astype(np.float32), np.exp(u).astype(np.float32)
     odds = odds if config.label.rule == 'roughness' else 0.0
     alike = _count_near(candidates, np.exp(given[3]) if odds > 0.0 else 0.0)
     noise = noise_among(alike, gate_noise)
@@ -256,9 +253,9 @@ def grow_inliers(
         layout = Padded.of(segments[batch], candidates.offsets)
         place, mask = layout.place, layout.mask
         state = _Batch(
-            layout.take(candidates.r),
-            layout.take(np.exp(u), 1.0),
-            sill,
+            layout.take(r),
+            layout.take(length_scale, 1.0),
+            float(sill),
             config.observation,
             layout.take(z),
             gate_noise,
@@ -308,7 +305,7 @@ def _grow(batch: _Batch, growth: GrowthConfig, odds: float) -> BoolArray:
     height = np.zeros_like(batch.r)
     # Segments that still grow, and the whitened rows of their inliers.
     active, joining = np.arange(len(chosen)), batch.seed
-    whitened = np.empty((len(chosen), 0, variance.shape[1]))
+    whitened = np.empty((len(chosen), 0, variance.shape[1]), variance.dtype)
     if odds > 0.0:
         predicted = combined(0.0, variance, *batch.from_neighbours)
         doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, True, odds)
@@ -390,7 +387,7 @@ def _condition(
     place = np.argsort(~new, axis=1, kind='stable')[:, : n_new.max()]
     is_new = np.arange(place.shape[1]) < n_new[:, None]
     which, rank = np.nonzero(is_new)
-    rows = np.zeros((*place.shape, batch.r.shape[1]))
+    rows = np.zeros((*place.shape, batch.r.shape[1]), batch.r.dtype)
     rows[which, rank] = _rows(batch, active[which], place[which, rank])
     if whitened.size:
         rows -= np.matmul(whitened[own, :, place], whitened)
@@ -399,7 +396,7 @@ def _condition(
     unit = inverse_of_lower(np.linalg.cholesky(within)) * is_new[:, :, None]
     rows = np.matmul(unit, rows)
     innovation = batch.z[segment, place] - height[segment, place]
-    innovation = np.matmul(unit, innovation[:, :, None])
+    innovation = np.matmul(unit, innovation[:, :, None].astype(unit.dtype))
     height[active] += np.matmul(innovation.swapaxes(1, 2), rows)[:, 0]
     variance[active] -= np.einsum('sij,sij->sj', rows, rows)
     return np.concatenate([whitened, rows], axis=1)
@@ -421,7 +418,7 @@ def _regress(
     """
     candidates, which = frame.candidates, np.flatnonzero(inliers.inlier)
     mean, std = np.full((2, *knot_u.shape), np.nan)
-    sill, noise = _variances(frame, theta, config)
+    sill, noise = _variances(frame, theta, config, ROUNDING)
     line = line_variances(config.observation)
     r, z, length_scale = candidates.r, candidates.z - frame.prior_mean, np.exp(u)
     noise = noise_among(inliers.alike, noise) + inliers.doubt

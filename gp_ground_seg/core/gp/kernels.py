@@ -19,9 +19,9 @@ try:
 except ImportError:  # then BLAS keeps its threads
     ThreadpoolController = None
 
-LARGEST_EXPONENT = 300.0
-"""Largest x of which ``exp(-x)`` is computed: 5e-131, as good as nothing. Numbers below 1e-308,
-which a square of this is not, lose digits and take numpy tens of times as long."""
+LARGEST_EXPONENT = 40.0
+"""Largest x of which ``exp(-x)`` is computed: 4e-18, as good as nothing. Squares of less lose
+digits in single precision, and take numpy tens of times as long."""
 SEGMENTS_PER_BATCH = 48
 """Larger batches waste room on padding and leave the processor's cache; smaller ones cost
 calls."""
@@ -131,10 +131,11 @@ def inverse_of_lower(factors: FloatArray) -> FloatArray:
 
     One by one takes a third of the time of ``np.linalg.inv``, which is for any matrix.
     """
-    from scipy.linalg.lapack import dtrtri
+    from scipy.linalg.lapack import get_lapack_funcs
 
     # LAPACK takes arrays by columns: our rows are to it the columns of an upper triangle.
-    return np.array([dtrtri(factor.T)[0].T for factor in factors])
+    invert = get_lapack_funcs('trtri', (factors,))
+    return np.array([invert(factor.T)[0].T for factor in factors])
 
 
 @functools.cache

@@ -174,7 +174,7 @@ _Group = TypeVar('_Group')
 def numbers_of(group: _Group) -> _Group:
     """Return the numbers of a group under the same names, for compiled code."""
     kind = type(group).Numbers  # type: ignore[attr-defined]
-    return cast(_Group, kind(*(getattr(group, name) for name in kind._fields)))
+    return cast(_Group, kind(*map(vars(group).get, kind._fields)))
 
 
 @dataclass(frozen=True)
