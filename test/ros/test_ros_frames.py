@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import importlib.util
 import math
+import struct
 import sys
 import threading
 import time
@@ -117,13 +118,45 @@ def tf(monkeypatch):
     return buffer
 
 
-def test_what_tf_sends_is_kept_and_its_newest_stamp_known(monkeypatch):
-    kept, known = [], [TransformStamped(child_frame_id=name) for name in 'ab']
-    known[0].header.stamp.sec = 7
-    message = types.SimpleNamespace(transforms=known)
-    monkeypatch.setattr(transforms, 'deserialize_message', lambda _raw, _kind: message)
-    assert transforms.keep_transforms(lambda one, _: kept.append(one), None, b'') == 7.0
-    assert kept == known
+def tf_message(stamps, parents, padding=b'\0'):
+    """Message of TF as its bytes, with a transform for each stamp [ns] and its parent."""
+    content = struct.pack('<I', len(stamps))
+    for stamp, parent in zip(stamps, parents, strict=True):
+        content += struct.pack('<iI', *divmod(stamp, 10**9))
+        for name in (parent.encode() + b'\0', b'lidar\0'):
+            content += padding * (-len(content) % 4) + struct.pack('<I', len(name)) + name
+        content += padding * (-len(content) % 8) + struct.pack('<7d', *np.arange(7.0))
+    return b'\0\1\0\0' + content
+
+
+@given(
+    st.lists(st.text('abcdefghi', min_size=1), min_size=1, max_size=4),
+    st.binary(min_size=1, max_size=1),
+)
+def test_transforms_are_kept_by_their_frames(names, padding):
+    n, key = len(names), transforms.names_in(tf_message([7 * 10**9 + 5] * len(names), names))
+    other = tf_message([3 * 10**9 + 1] * n, names, padding)
+    assert transforms.names_in(other) == key
+    assert transforms.stamp_in(other, transforms.FIRST_STAMP) == 3 * 10**9 + 1
+    for changed in ([*names, 'a'], [names[0] + 'b', *names[1:]]):
+        assert transforms.names_in(tf_message([1] * len(changed), changed)) != key
+    # One whose stamps differ is read at once.
+    assert not transforms.names_in(tf_message([*range(n), 5, 6], [*names, 'a', 'b']))
+
+
+@given(st.lists(st.integers(1, 10**10), min_size=1), st.integers(1, 10**10))
+def test_of_transforms_those_around_a_stamp_are_read_once(stamps, stamp):
+    kept = transforms.Kept()
+    for own in stamps:
+        kept.add(own, b'%d' % own)
+    wanted = [
+        *sorted(s for s in stamps if s < stamp)[-1:],
+        *sorted(s for s in stamps if s >= stamp)[:1],
+    ]
+    assert [int(message) for message in kept.read(stamp)] == wanted
+    assert not list(kept.read(stamp)) and len(list(kept.read(0))) == len(stamps) - len(wanted)
+    kept.add(4 * transforms.KEPT_TIME, b'new')
+    assert [*kept.read(0)] == [b'new'] and not [*kept.read(stamp)]
 
 
 def cloud_of(points, seconds, nanosec=0):
