@@ -300,14 +300,17 @@ def _steps(returns: _Returns, upper: IntArray, slope: FloatArray, max_step_down:
     lower, ground, is_first = upper + 1, _Ground.of(returns), r[upper] == FOOT
     begin = (1.0 - BEFORE) * r[upper] - NEAREST
     middle, level, slope_before, roughness = ground.window(sector[upper], begin, 1.001 * r[upper])
-    runs_down = -slope_before >= ON_SLOPE * slope
-    runs_down &= -slope_before * (r[upper] - middle) > roughness
-    # The far wall of a trench makes one window rough: rough ground makes both so. Where one ring
-    # is all that is seen before the step, it tells neither slope nor roughness.
+    # Where one ring is all that is seen before the step, it tells no roughness, and the slope is
+    # that from the foot of the robot.
+    is_alone, below = slope_before == 0.0, z[0] - z[upper]
+    slope_before = np.where(is_alone, -below / r[upper], slope_before)
+    descent = np.where(is_alone, below - ON_LEVEL, -slope_before * (r[upper] - middle))
+    runs_down = (-slope_before >= ON_SLOPE * slope) & (descent > roughness)
+    # The far wall of a trench makes one window rough: rough ground makes both so.
     begin = 1.1 * r[lower] + 0.5
     *_, near = ground.window(sector[upper], begin, BEHIND * begin)
     *_, far = ground.window(sector[upper], BEHIND * begin, BEHIND**2 * begin)
-    behind = np.where(slope_before == 0.0, np.maximum(near, far), np.minimum(near, far))
+    behind = np.where(is_alone, np.maximum(near, far), np.minimum(near, far))
     roughness = np.maximum(roughness, behind)
     # What is seen behind it goes down as well, or leads back up to the level of the robot.
     goes_on = np.zeros(len(upper), dtype=np.bool_)
