@@ -252,11 +252,6 @@ class CloudSubscription:
         self._node.get_logger().info(words)
 
 
-def nanoseconds_of(stamp: TimeMessage) -> int:
-    """Return the time of a header [ns]."""
-    return int(10**9 * stamp.sec + stamp.nanosec)
-
-
 def seconds_of(stamp: TimeMessage) -> float:
     """Return the time of a header [s]."""
-    return 1e-9 * nanoseconds_of(stamp)
+    return float(stamp.sec + 1e-9 * stamp.nanosec)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import importlib
 import struct
 import time
-from bisect import bisect_left
+from bisect import bisect_left, insort
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
-from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +26,7 @@ from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.core.parameters.config import NO_FRAME, Config
 from gp_ground_seg.core.pipeline.points import angles_of
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
-from gp_ground_seg.ros.input import STEADY_CLOCK, OnCloud, nanoseconds_of
+from gp_ground_seg.ros.input import STEADY_CLOCK
 
 KEPT_JUMP = 1.0  # after a longer jump back in time, transforms are forgotten [s]
 MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]
@@ -107,6 +106,11 @@ class CloudFrames(NamedTuple):
     waited: float = 0.0  # how long the cloud was held [s]
 
 
+Found = CloudFrames | Exception
+"""What is known of a cloud, or why it is refused."""
+NO_FRAMES = CloudFrames()
+
+
 class Unattended(CallbackGroup):  # type: ignore[misc]
     """Keeps subscriptions from the executor, which spends 0.3 ms on a message, and their events.
 
@@ -118,68 +122,57 @@ class Unattended(CallbackGroup):  # type: ignore[misc]
         return False
 
 
-class Kept:
-    """Messages of `KEPT_TIME` by their stamps [ns], as bytes: most are never read."""
-
-    def __init__(self) -> None:
-        self._stamps: list[int] = []
-        self._messages: list[bytes] = []  # empty where they have been read
+class Kept(list[tuple[int, bytes]]):
+    """Messages of `KEPT_TIME`, as bytes behind their stamps [ns]: most are never read."""
 
     def add(self, stamp: int, message: bytes) -> int:
         """Keep a message, and forget old ones; return its stamp."""
-        index = bisect_left(self._stamps, stamp)
-        self._stamps.insert(index, stamp)
-        self._messages.insert(index, message)
-        if stamp - self._stamps[0] > 2 * KEPT_TIME:
-            n_old = bisect_left(self._stamps, stamp - KEPT_TIME)
-            del self._stamps[:n_old], self._messages[:n_old]
+        insort(self, (stamp, message))
+        if stamp - self[0][0] > 2 * KEPT_TIME:
+            del self[: bisect_left(self, (stamp - KEPT_TIME, b''))]
         return stamp
 
-    def nearest(self, stamp: int) -> tuple[int, bytes] | None:
-        """Return how far the message nearest to `stamp` is off [ns], and the message."""
-        beside = ((abs(self._stamps[k] - stamp), self._messages[k]) for k in self._beside(stamp))
-        return min(beside, default=None, key=itemgetter(0))
+    def beside(self, stamp: int) -> slice:
+        """Return where the messages next to `stamp` are, or all if it is 0."""
+        index = bisect_left(self, (stamp, b''))
+        return slice(max(index - 1, 0), index + 1) if stamp else slice(None)
 
-    def read(self, stamp: int) -> Iterator[bytes]:
-        """Yield the messages next to `stamp`, or all if it is 0; each but once."""
-        for k in self._beside(stamp) if stamp else range(len(self._stamps)):
-            message, self._messages[k] = self._messages[k], b''
-            if message:
-                yield message
+    def read(self, stamp: int) -> list[bytes]:
+        """Return those messages, each but once."""
+        beside = self.beside(stamp)
+        found, self[beside] = self[beside], [(own, b'') for own, _ in self[beside]]
+        return [message for _, message in found if message]
 
-    def _beside(self, stamp: int) -> range:
-        index = bisect_left(self._stamps, stamp)
-        return range(max(index - 1, 0), min(index + 1, len(self._stamps)))
+
+def stamp_of(header: Header) -> int:
+    """Return the stamp of a header [ns]."""
+    return int(10**9 * header.stamp.sec + header.stamp.nanosec)
 
 
 def stamp_in(message: bytes, begin: int) -> int:
     """Return the stamp that begins in a serialised message at byte `begin` [ns]."""
-    seconds, nanoseconds = struct.unpack_from(f'{_order(message)}iI', message, begin)
+    order = '<' if message[1] & 1 else '>'
+    seconds, nanoseconds = struct.unpack_from(f'{order}iI', message, begin)
     return int(10**9 * seconds + nanoseconds)
 
 
 def names_in(message: bytes) -> bytes:
     """Return the frames that a serialised message of TF is about.
 
-    Nothing if its transforms have not all one stamp, or it is not in plain CDR.
+    Nothing if its transforms have not all one stamp, or it is not in plain little-endian CDR.
     """
-    names, order = [], _order(message)
-    (count,) = struct.unpack_from(f'{order}I', message, CDR_HEADER)
-    begin = FIRST_STAMP
-    for _ in range(count if message[1] <= 1 else 0):
+    names, begin = b'', FIRST_STAMP
+    (count,) = struct.unpack_from('<I', message, CDR_HEADER)
+    for _ in range(count if message[1] == 1 else 0):
         if message[begin : begin + 8] != message[FIRST_STAMP : FIRST_STAMP + 8]:
             return b''
         begin += 8
         for _parent_and_child in range(2):
-            (length,) = struct.unpack_from(f'{order}I', message, begin)
-            names.append(message[begin : begin + 4 + length])
+            (length,) = struct.unpack_from('<I', message, begin)
+            names += message[begin : begin + 4 + length]
             begin += 4 + length + -length % 4
         begin += (CDR_HEADER - begin) % 8 + TRANSFORM  # numbers are aligned to 8 bytes
-    return b''.join(names)
-
-
-def _order(message: bytes) -> str:
-    return '<' if message[1] & 1 else '>'
+    return names
 
 
 class FrameListener:
@@ -192,7 +185,7 @@ class FrameListener:
     only next to the stamp of a cloud: to read a transform takes ten times as long as to take it.
     """
 
-    def __init__(self, node: Node, config: Config, use: OnCloud) -> None:
+    def __init__(self, node: Node, config: Config, use: Callable[..., None]) -> None:
         self.config = config
         self._node, self._use = node, use
         # Of each topic the stamp that came last [ns], and when [s].
@@ -219,9 +212,7 @@ class FrameListener:
         self._subscriptions = [
             node.create_subscription(*source, callback_group=group) for source in sources
         ]
-        self._waiting: deque[tuple[float, Header, Callable[[], None]]] = deque()
-        self._held = 0.0  # how long the cloud that is used now was held [s]
-        self._found: CloudFrames | None = None  # what is known of it
+        self._waiting: deque[tuple[float, Header, Callable[[Found], None]]] = deque()
         self._timer = node.create_timer(REVIEW_PERIOD, self._review, clock=STEADY_CLOCK)
         self._timer.cancel()
 
@@ -255,54 +246,48 @@ class FrameListener:
         transforms = deserialize_message(message, self._kind).transforms
         for transform in transforms:
             keep(transform, 'default_authority')
-        return max((nanoseconds_of(t.header.stamp) for t in transforms), default=0)
+        return max((stamp_of(t.header) for t in transforms), default=0)
 
     def _review(self) -> None:
         self._take_all()
         while self._waiting:
             since, header, use = self._waiting[0]
-            if self._has_to_wait(header, since):
+            found = self._find(header, time.monotonic() - since)
+            if found is None:
                 self._timer.reset()
                 return
             self._waiting.popleft()
-            self._held = time.monotonic() - since
-            use()
+            use(found)
         self._timer.cancel()
 
-    def _has_to_wait(self, header: Header, since: float) -> bool:
-        """Return whether the pose at the stamp of a cloud, held `since` then, may still come."""
-        stamp, waited = nanoseconds_of(header.stamp), time.monotonic() - since
-        is_early, self._found = waited < MAX_WAIT, None
+    def _find(self, header: Header, waited: float) -> Found | None:
+        """Return the frames at the stamp of a cloud that has `waited` [s]; None to wait on.
+
+        If TF does not reach the stamp, its newest transform is used.
+        """
+        stamp, is_early = stamp_of(header), waited < MAX_WAIT
         if is_early and self._imu and self._news.get(self._imu, NEVER)[0] < stamp:
-            return True
+            return None
         try:
-            self._found = self._frames_at(header, is_exact=is_early)
+            return self._frames_at(header, is_exact=is_early)._replace(waited=waited)
         except self._not_yet:
-            return True
-        except (PointCloudError, ValueError):  # the cloud is refused with the reason
-            return MAX_WAIT <= waited < LONGEST_WAIT and self._is_behind(stamp)
-        return False
+            return None
+        except (PointCloudError, ValueError) as error:  # the cloud is refused with the reason
+            is_behind = MAX_WAIT <= waited < LONGEST_WAIT and self._is_behind(stamp)
+            return None if is_behind else error
 
     def _is_behind(self, stamp: int) -> bool:
         """Return whether messages that are older than the `stamp` of a cloud [ns] still come."""
         soon = time.monotonic() - MAX_WAIT
         return any(newest < stamp and came > soon for newest, came in self._news.values())
 
-    def look_up(self, header: Header) -> CloudFrames:
-        """Return tilt and place of the sensor at the stamp of the cloud that is used now.
-
-        If TF does not reach the stamp, its newest transform is used. Raises a PointCloudError if a
-        transform or an orientation is missing.
-        """
-        return (self._found or self._frames_at(header))._replace(waited=self._held)
-
-    def _frames_at(self, header: Header, is_exact: bool = False) -> CloudFrames:
+    def _frames_at(self, header: Header, is_exact: bool) -> CloudFrames:
         tilt, origin, base, ages = None, None, None, [0]
-        frame_id, frame, stamp = header.frame_id, self.config.frame, nanoseconds_of(header.stamp)
+        frame_id, frame, stamp = header.frame_id, self.config.frame, stamp_of(header)
 
         def transform(target: str, source: str, way: str) -> Any:
             found = self._look_up(target, source, stamp, way, is_exact)
-            ages.append(abs(stamp - nanoseconds_of(found.header.stamp)))
+            ages.append(abs(stamp - stamp_of(found.header)))
             return found.transform
 
         if frame.level == 'tf':
@@ -328,10 +313,10 @@ class FrameListener:
 
         Raises a PointCloudError without one that is near.
         """
-        found = self._orientations.nearest(stamp)
-        if found is None:
+        beside = self._orientations[self._orientations.beside(stamp)]
+        if not beside:
             raise PointCloudError(f'no message on {self._imu}, for frame.level = imu')
-        off, message = found
+        off, message = min((abs(own - stamp), message) for own, message in beside)
         if 1e-9 * off > IMU_TOLERANCE:
             raise PointCloudError(
                 f'the nearest orientation on {self._imu} is {1e-9 * off:.3g} s from its stamp: '
@@ -381,20 +366,14 @@ class FrameListener:
 class KeptPose:
     """Pose of the last cloud that showed the ground well, for later clouds in the same frame."""
 
-    def __init__(self) -> None:
-        self._frame = ''
-        self.forget()
-
-    def forget(self) -> None:
-        """Keep no pose, as after the start."""
-        self._pose: SensorPose | None = None
-        self._is_in_use = False
+    _frame = ''
+    _pose: SensorPose | None = None
+    _is_in_use = False
 
     def fallback(self, frame: str) -> SensorPose | None:
         """Return the pose for a cloud in `frame`, or None; that of another frame is forgotten."""
         if frame != self._frame:
-            self._frame = frame
-            self.forget()
+            self._frame, self._pose, self._is_in_use = frame, None, False
         return self._pose
 
     def note(self, pose: SensorPose) -> bool:
