@@ -30,14 +30,13 @@ from gp_ground_seg.ros.input import STEADY_CLOCK
 
 KEPT_JUMP = 1.0  # after a longer jump back in time, transforms are forgotten [s]
 MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]
-LONGEST_WAIT = 1.0  # the same, where it would be refused, and older messages still come [s]
+LONGEST_WAIT = 1.0  # the same, where it would be refused: the node may be behind [s]
 REVIEW_PERIOD = 0.01  # time between two checks of whether they have come [s]
 IMU_TOLERANCE = 0.05  # longest time between a cloud and its orientation [s]
 KEPT_TIME = 10 * 10**9  # time that messages are kept, as in a buffer of TF [ns]
 CDR_HEADER = 4  # bytes before the content of a serialised message
 FIRST_STAMP = CDR_HEADER + 4  # that of a message of TF, behind the number of transforms [bytes]
 TRANSFORM = 7 * 8  # translation and quaternion [bytes]
-NEVER = -1, 0.0  # stamp and arrival of what has not come
 DEPTH = 1000  # messages kept: those of 1 s at 1 kHz
 BEST_EFFORT = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE)
@@ -125,12 +124,11 @@ class Unattended(CallbackGroup):  # type: ignore[misc]
 class Kept(list[tuple[int, bytes]]):
     """Messages of `KEPT_TIME`, as bytes behind their stamps [ns]: most are never read."""
 
-    def add(self, stamp: int, message: bytes) -> int:
-        """Keep a message, and forget old ones; return its stamp."""
+    def add(self, stamp: int, message: bytes) -> None:
+        """Keep a message, and forget old ones."""
         insort(self, (stamp, message))
         if stamp - self[0][0] > 2 * KEPT_TIME:
             del self[: bisect_left(self, (stamp - KEPT_TIME, b''))]
-        return stamp
 
     def beside(self, stamp: int) -> slice:
         """Return where the messages next to `stamp` are, or all if it is 0."""
@@ -180,23 +178,21 @@ class FrameListener:
 
     `hold` takes clouds and passes them to `use` in their order: each as soon as transform and
     orientation at its stamp are known, or after `MAX_WAIT`. One that would be refused then waits
-    on, up to `LONGEST_WAIT`, while older messages still come: the node is behind, or their sender.
-    It does not block. What TF and IMU have sent is taken when a cloud comes or waits, and read
-    only next to the stamp of a cloud: to read a transform takes ten times as long as to take it.
+    on, up to `LONGEST_WAIT`: the node may be behind, or their sender. It does not block. What TF
+    and IMU have sent is taken when a cloud comes or waits, and read only next to the stamp of a
+    cloud: to read a transform takes ten times as long as to take it.
     """
 
     def __init__(self, node: Node, config: Config, use: Callable[..., None]) -> None:
         self.config = config
         self._node, self._use = node, use
-        # Of each topic the stamp that came last [ns], and when [s].
-        self._news: dict[str, tuple[int, float]] = {}
         self._orientations = Kept()
         self._transforms: defaultdict[bytes, Kept] = defaultdict(Kept)  # by the names in them
         self._imu = node.resolve_topic_name('imu') if config.frame.level == 'imu' else ''
         self._buffer: Any = None
         self._not_yet: Any = ()  # what TF raises
         self._too_late: Any = ()
-        sources: list[tuple[Any, str, Callable[[bytes], int], QoSProfile]] = []
+        sources: list[tuple[Any, str, Callable[[bytes], None], QoSProfile]] = []
         if self._imu:
             sources += [(Imu, 'imu', self._take_imu, BEST_EFFORT)]  # takes from any publisher
         if (tf2 := find_module('tf2_ros')) is not None:
@@ -225,28 +221,24 @@ class FrameListener:
     def _take_all(self) -> None:
         """Take all that TF and IMU have sent."""
         for source in self._subscriptions:
-            newest, now = None, time.monotonic()
             with source.handle:
                 while (taken := source.handle.take_message(source.msg_type, True)) is not None:
-                    newest = source.callback(taken[0])
-            if newest is not None:
-                self._news[source.topic_name] = newest, now
+                    source.callback(taken[0])
 
-    def _take_imu(self, message: bytes) -> int:
-        return self._orientations.add(stamp_in(message, CDR_HEADER), message)
+    def _take_imu(self, message: bytes) -> None:
+        self._orientations.add(stamp_in(message, CDR_HEADER), message)
 
-    def _take_tf(self, message: bytes) -> int:
+    def _take_tf(self, message: bytes) -> None:
         if names := names_in(message):
-            return self._transforms[names].add(stamp_in(message, FIRST_STAMP), message)
-        return self._read(message)
+            self._transforms[names].add(stamp_in(message, FIRST_STAMP), message)
+        else:
+            self._read(message)
 
-    def _read(self, message: bytes, is_static: bool = False) -> int:
-        """Give transforms to the buffer of TF; return their newest stamp [ns]."""
+    def _read(self, message: bytes, is_static: bool = False) -> None:
+        """Give transforms to the buffer of TF."""
         keep = self._buffer.set_transform_static if is_static else self._buffer.set_transform
-        transforms = deserialize_message(message, self._kind).transforms
-        for transform in transforms:
+        for transform in deserialize_message(message, self._kind).transforms:
             keep(transform, 'default_authority')
-        return max((stamp_of(t.header) for t in transforms), default=0)
 
     def _review(self) -> None:
         self._take_all()
@@ -265,21 +257,15 @@ class FrameListener:
 
         If TF does not reach the stamp, its newest transform is used.
         """
-        stamp, is_early = stamp_of(header), waited < MAX_WAIT
-        if is_early and self._imu and self._news.get(self._imu, NEVER)[0] < stamp:
+        is_early, newest = waited < MAX_WAIT, self._orientations[-1:]
+        if is_early and self._imu and not (newest and newest[0][0] >= stamp_of(header)):
             return None
         try:
             return self._frames_at(header, is_exact=is_early)._replace(waited=waited)
         except self._not_yet:
             return None
         except (PointCloudError, ValueError) as error:  # the cloud is refused with the reason
-            is_behind = MAX_WAIT <= waited < LONGEST_WAIT and self._is_behind(stamp)
-            return None if is_behind else error
-
-    def _is_behind(self, stamp: int) -> bool:
-        """Return whether messages that are older than the `stamp` of a cloud [ns] still come."""
-        soon = time.monotonic() - MAX_WAIT
-        return any(newest < stamp and came > soon for newest, came in self._news.values())
+            return None if waited < LONGEST_WAIT else error
 
     def _frames_at(self, header: Header, is_exact: bool) -> CloudFrames:
         tilt, origin, base, ages = None, None, None, [0]
@@ -348,12 +334,13 @@ class FrameListener:
             raise PointCloudError(f'no transform {way}: {error}') from error
 
     def time_jumped(self, seconds: float) -> None:
-        """Forget all transforms after a long jump back, also those that were not taken yet."""
+        """Forget all after a long jump back, also what was not taken yet."""
         self._take_all()
-        self._news.clear()
-        if seconds > KEPT_JUMP and self._buffer is not None:
-            self._buffer.clear()
+        if seconds > KEPT_JUMP:
+            self._orientations.clear()
             self._transforms.clear()
+            if self._buffer is not None:
+                self._buffer.clear()
 
     def close(self) -> None:
         """Stop listening; clouds that wait are dropped."""
