@@ -188,13 +188,11 @@ def find_edges(
     order = np.lexsort((returns.r[steps.upper], returns.sector[steps.upper]))
     _, nearest = np.unique(returns.sector[steps.upper[order]], return_index=True)
     steps = steps.where(order[nearest])
-    if len(steps.upper) < MIN_STEPS:
-        return edges
     sector, near = returns.sector[steps.upper], returns.r[steps.upper]
     # Where the line of sight over the edge meets the upper ground, if that went on.
     far = np.maximum(near, -returns.z[steps.upper] / returns.sight[steps.lower])
     gap, group = _group(sector, near, far)
-    for number in range(int(group.max()) + 1):
+    for number in np.unique(group):
         members = np.flatnonzero(group == number)
         if not _is_edge(steps.where(members), near[members], max_step_down):
             continue
@@ -402,7 +400,7 @@ def _group(sector: IntArray, near: FloatArray, far: FloatArray) -> tuple[IntArra
     ends = np.flatnonzero(~joined)
     # Numbers go up behind each end; what follows the last one belongs to the first edge.
     group = np.cumsum(np.roll(~joined, 1))
-    group = (group - group[0]) % max(len(ends), 1)
+    group = (group - group[:1]) % max(len(ends), 1)
     return np.where(joined, gap, 0), group
 
 

@@ -191,7 +191,6 @@ class FrameListener:
         self._imu = node.resolve_topic_name('imu') if config.frame.level == 'imu' else ''
         self._buffer: Any = None
         self._not_yet: Any = ()  # what TF raises
-        self._too_late: Any = ()
         sources: list[tuple[Any, str, Callable[[bytes], None], QoSProfile]] = []
         if self._imu:
             sources += [(Imu, 'imu', self._take_imu, BEST_EFFORT)]  # takes from any publisher
