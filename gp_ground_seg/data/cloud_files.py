@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
 KITTI_COLUMNS = 4
 MIN_COLUMNS = 3
-_OTHER_COLUMNS = range(MIN_COLUMNS, 9)  # that are tried
+_OTHER_COLUMNS = range(MIN_COLUMNS, 11)  # that are tried
 
 _MIN_POINTS = 100  # fewer are not judged
 _N_JUDGED = 10_000  # points of a larger scan that are judged
@@ -50,8 +50,9 @@ _SMALLEST = 1e-6  # coordinate that can be measured [m]
 _MAX_UNMEASURABLE = 0.4  # share of them; z may be zero in a whole scan
 # What a number is says something about its column if the columns are right, and otherwise less:
 # z is low, an intensity positive. Points need not be in any order for that.
-_PERIOD = 840  # a multiple of all `_OTHER_COLUMNS`
-_N_PERIODS = 100  # of a larger file that are judged
+_PERIOD = 2520  # a multiple of all `_OTHER_COLUMNS`
+_N_PERIODS = 34  # of a larger file that are judged
+_FEWEST = 1680  # numbers of a file that is judged
 _N_CLASSES = 16  # of equally many numbers
 _MUCH_MORE, _CHANCE = 1.25, 0.05  # times as much, and by so much [nat]
 _TRANSPOSED = 20  # columns from which on a table of fewer rows is
@@ -220,9 +221,10 @@ def read_scan(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[np.
 
 def find_columns(numbers: npt.NDArray[np.float32], columns: int) -> int:
     """Return the number of columns by which the numbers differ much more; 0 if there is none."""
-    if len(numbers) < 2 * _PERIOD:
+    if len(numbers) < _FEWEST:
         return 0
-    whole = numbers[: len(numbers) // _PERIOD * _PERIOD].reshape(-1, _PERIOD)
+    n_whole = len(numbers) // _PERIOD * _PERIOD or len(numbers)
+    whole = numbers[:n_whole].reshape(-1, min(_PERIOD, n_whole))
     sample = np.nan_to_num(whole[:: 1 + len(whole) // _N_PERIODS]).ravel()
     edges = np.unique(np.quantile(sample, np.linspace(0.0, 1.0, _N_CLASSES + 1)[1:-1]))
     classes = np.searchsorted(edges, sample, side='right')

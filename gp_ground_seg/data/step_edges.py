@@ -188,13 +188,11 @@ def find_edges(
     order = np.lexsort((returns.r[steps.upper], returns.sector[steps.upper]))
     _, nearest = np.unique(returns.sector[steps.upper[order]], return_index=True)
     steps = steps.where(order[nearest])
-    if len(steps.upper) < MIN_STEPS:
-        return edges
     sector, near = returns.sector[steps.upper], returns.r[steps.upper]
     # Where the line of sight over the edge meets the upper ground, if that went on.
     far = np.maximum(near, -returns.z[steps.upper] / returns.sight[steps.lower])
     gap, group = _group(sector, near, far)
-    for number in range(int(group.max()) + 1):
+    for number in np.unique(group):
         members = np.flatnonzero(group == number)
         if not _is_edge(steps.where(members), near[members], max_step_down):
             continue
@@ -300,14 +298,17 @@ def _steps(returns: _Returns, upper: IntArray, slope: FloatArray, max_step_down:
     lower, ground, is_first = upper + 1, _Ground.of(returns), r[upper] == FOOT
     begin = (1.0 - BEFORE) * r[upper] - NEAREST
     middle, level, slope_before, roughness = ground.window(sector[upper], begin, 1.001 * r[upper])
-    runs_down = -slope_before >= ON_SLOPE * slope
-    runs_down &= -slope_before * (r[upper] - middle) > roughness
-    # The far wall of a trench makes one window rough: rough ground makes both so. Where one ring
-    # is all that is seen before the step, it tells neither slope nor roughness.
+    # Where one ring is all that is seen before the step, it tells no roughness, and the slope is
+    # that from the foot of the robot.
+    is_alone, below = slope_before == 0.0, z[0] - z[upper]
+    slope_before = np.where(is_alone, -below / r[upper], slope_before)
+    descent = np.where(is_alone, below - ON_LEVEL, -slope_before * (r[upper] - middle))
+    runs_down = (-slope_before >= ON_SLOPE * slope) & (descent > roughness)
+    # The far wall of a trench makes one window rough: rough ground makes both so.
     begin = 1.1 * r[lower] + 0.5
     *_, near = ground.window(sector[upper], begin, BEHIND * begin)
     *_, far = ground.window(sector[upper], BEHIND * begin, BEHIND**2 * begin)
-    behind = np.where(slope_before == 0.0, np.maximum(near, far), np.minimum(near, far))
+    behind = np.where(is_alone, np.maximum(near, far), np.minimum(near, far))
     roughness = np.maximum(roughness, behind)
     # What is seen behind it goes down as well, or leads back up to the level of the robot.
     goes_on = np.zeros(len(upper), dtype=np.bool_)
@@ -399,7 +400,7 @@ def _group(sector: IntArray, near: FloatArray, far: FloatArray) -> tuple[IntArra
     ends = np.flatnonzero(~joined)
     # Numbers go up behind each end; what follows the last one belongs to the first edge.
     group = np.cumsum(np.roll(~joined, 1))
-    group = (group - group[0]) % max(len(ends), 1)
+    group = (group - group[:1]) % max(len(ends), 1)
     return np.where(joined, gap, 0), group
 
 

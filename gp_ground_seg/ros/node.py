@@ -43,7 +43,8 @@ from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
 from gp_ground_seg.ros.session import StopRequest, large_cloud_transport, stop_on_signals
 from gp_ground_seg.ros.transforms import (
-    CloudFrames,
+    NO_FRAMES,
+    Found,
     FrameListener,
     KeptPose,
     check_tf2,
@@ -110,7 +111,9 @@ class GroundSegmentationNode(ConfiguredNode):
         self._load_backend(self.config)
         self._input.review()
 
-    def _on_cloud(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
+    def _on_cloud(
+        self, cloud: PointCloud2, arrival: float, n_lost: int, frames: Found = NO_FRAMES
+    ) -> None:
         """Read a cloud, segment it, publish the result, and note it; or say why it is refused.
 
         It came at the time `arrival` of ``time.monotonic`` [s]; `n_lost` before it were lost.
@@ -121,9 +124,10 @@ class GroundSegmentationNode(ConfiguredNode):
         start, header = time.monotonic(), cloud.header
         self._diagnostics.arrived(cloud, arrival, n_lost)
         try:
+            if isinstance(frames, Exception):
+                raise frames
             # Code for the other precision would have to be compiled at the first start too.
             points = read_xyz(cloud, is_single=True)
-            frames = self._frames.look_up(header) if self._frames else CloudFrames()
             fallback = self._kept.fallback(header.frame_id)
             result = self._segmenter.segment(
                 points, frames.tilt, frames.origin, fallback, frames.base
@@ -170,7 +174,7 @@ class GroundSegmentationNode(ConfiguredNode):
         self._load_backend(config)
         runtime = config.runtime if self._is_compiled else self._segmenter.config.runtime
         self._segmenter.configure(dataclasses.replace(config, runtime=runtime))
-        self._kept.forget()
+        self._kept = KeptPose()
         self._follow_frames(config)
         self._diagnostics.configure(config)
 
@@ -222,7 +226,7 @@ class GroundSegmentationNode(ConfiguredNode):
         self._library_log.close()
 
     def _on_time_jump(self, seconds: float) -> None:
-        self._kept.forget()
+        self._kept = KeptPose()
         if self._frames is not None:
             self._frames.time_jumped(seconds)
         self._diagnostics.input.time_jumped()

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import math
 import struct
 import time
-from collections import deque
+from bisect import bisect_left, insort
+from collections import defaultdict, deque
 from collections.abc import Callable
 from functools import partial
-from itertools import takewhile
-from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,14 +26,17 @@ from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.core.parameters.config import NO_FRAME, Config
 from gp_ground_seg.core.pipeline.points import angles_of
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
-from gp_ground_seg.ros.input import STEADY_CLOCK, OnCloud, seconds_of
+from gp_ground_seg.ros.input import STEADY_CLOCK
 
 KEPT_JUMP = 1.0  # after a longer jump back in time, transforms are forgotten [s]
 MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]
-LONGEST_WAIT = 1.0  # the same, where it would be refused, and older messages still come [s]
+LONGEST_WAIT = 1.0  # the same, where it would be refused: the node may be behind [s]
 REVIEW_PERIOD = 0.01  # time between two checks of whether they have come [s]
 IMU_TOLERANCE = 0.05  # longest time between a cloud and its orientation [s]
+KEPT_TIME = 10 * 10**9  # time that messages are kept, as in a buffer of TF [ns]
 CDR_HEADER = 4  # bytes before the content of a serialised message
+FIRST_STAMP = CDR_HEADER + 4  # that of a message of TF, behind the number of transforms [bytes]
+TRANSFORM = 7 * 8  # translation and quaternion [bytes]
 DEPTH = 1000  # messages kept: those of 1 s at 1 kHz
 BEST_EFFORT = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE)
@@ -104,6 +105,11 @@ class CloudFrames(NamedTuple):
     waited: float = 0.0  # how long the cloud was held [s]
 
 
+Found = CloudFrames | Exception
+"""What is known of a cloud, or why it is refused."""
+NO_FRAMES = CloudFrames()
+
+
 class Unattended(CallbackGroup):  # type: ignore[misc]
     """Keeps subscriptions from the executor, which spends 0.3 ms on a message, and their events.
 
@@ -115,53 +121,56 @@ class Unattended(CallbackGroup):  # type: ignore[misc]
         return False
 
 
-class ImuListener:
-    """Keeps what ``imu`` has sent, as its bytes: of 20 messages one is read."""
+class Kept(list[tuple[int, bytes]]):
+    """Messages of `KEPT_TIME`, as bytes behind their stamps [ns]: most are never read."""
 
-    newest = -math.inf  # stamp of the message that came last [s]
+    def add(self, stamp: int, message: bytes) -> None:
+        """Keep a message, and forget old ones."""
+        insort(self, (stamp, message))
+        if stamp - self[0][0] > 2 * KEPT_TIME:
+            del self[: bisect_left(self, (stamp - KEPT_TIME, b''))]
 
-    def __init__(self, node: Node) -> None:
-        self.topic: str = node.resolve_topic_name('imu')
-        self._messages: deque[tuple[float, bytes]] = deque(maxlen=DEPTH)  # with their stamps [s]
+    def beside(self, stamp: int) -> slice:
+        """Return where the messages next to `stamp` are, or all if it is 0."""
+        index = bisect_left(self, (stamp, b''))
+        return slice(max(index - 1, 0), index + 1) if stamp else slice(None)
 
-    def take(self, message: bytes) -> float:
-        """Keep a message; return its stamp [s]."""
-        order = '<' if message[1] & 1 else '>'
-        seconds, nanoseconds = struct.unpack_from(f'{order}iI', message, CDR_HEADER)
-        self.newest = float(seconds + 1e-9 * nanoseconds)
-        self._messages.append((self.newest, message))
-        return self.newest
-
-    def at(self, stamp: float) -> tuple[Imu, float]:
-        """Return the message nearest to the `stamp` of a cloud, and how far that is off [s].
-
-        Raises a PointCloudError without one that is near.
-        """
-        if not self._messages:
-            raise PointCloudError(f'no message on {self.topic}, for frame.level = imu')
-        newest = takewhile(lambda kept: kept[0] > stamp - IMU_TOLERANCE, reversed(self._messages))
-        near = list(newest) or self._messages
-        off, raw = min(((abs(t - stamp), m) for t, m in near), key=itemgetter(0))
-        if off > IMU_TOLERANCE:
-            raise PointCloudError(
-                f'the nearest orientation on {self.topic} is {off:.3g} s from its stamp: '
-                f'must be within {IMU_TOLERANCE:g} s'
-            )
-        found = deserialize_message(raw, Imu)
-        if found.orientation_covariance[0] == -1.0:
-            raise PointCloudError(
-                f'{self.topic} has no orientation (orientation_covariance[0] is -1): remap imu to '
-                'the output of a filter, such as imu_filter_madgwick'
-            )
-        return found, off
+    def read(self, stamp: int) -> list[bytes]:
+        """Return those messages, each but once."""
+        beside = self.beside(stamp)
+        found, self[beside] = self[beside], [(own, b'') for own, _ in self[beside]]
+        return [message for _, message in found if message]
 
 
-def keep_transforms(keep: Callable[[Any, str], None], kind: Any, raw: bytes) -> float:
-    """Pass the transforms in a message of TF to `keep`; return the newest stamp in it [s]."""
-    transforms = deserialize_message(raw, kind).transforms
-    for transform in transforms:
-        keep(transform, 'default_authority')
-    return max((seconds_of(t.header.stamp) for t in transforms), default=0.0)
+def stamp_of(header: Header) -> int:
+    """Return the stamp of a header [ns]."""
+    return int(10**9 * header.stamp.sec + header.stamp.nanosec)
+
+
+def stamp_in(message: bytes, begin: int) -> int:
+    """Return the stamp that begins in a serialised message at byte `begin` [ns]."""
+    order = '<' if message[1] & 1 else '>'
+    seconds, nanoseconds = struct.unpack_from(f'{order}iI', message, begin)
+    return int(10**9 * seconds + nanoseconds)
+
+
+def names_in(message: bytes) -> bytes:
+    """Return the frames that a serialised message of TF is about.
+
+    Nothing if its transforms have not all one stamp, or it is not in plain little-endian CDR.
+    """
+    names, begin = b'', FIRST_STAMP
+    (count,) = struct.unpack_from('<I', message, CDR_HEADER)
+    for _ in range(count if message[1] == 1 else 0):
+        if message[begin : begin + 8] != message[FIRST_STAMP : FIRST_STAMP + 8]:
+            return b''
+        begin += 8
+        for _parent_and_child in range(2):
+            (length,) = struct.unpack_from('<I', message, begin)
+            names += message[begin : begin + 4 + length]
+            begin += 4 + length + -length % 4
+        begin += (CDR_HEADER - begin) % 8 + TRANSFORM  # numbers are aligned to 8 bytes
+    return names
 
 
 class FrameListener:
@@ -169,37 +178,36 @@ class FrameListener:
 
     `hold` takes clouds and passes them to `use` in their order: each as soon as transform and
     orientation at its stamp are known, or after `MAX_WAIT`. One that would be refused then waits
-    on, up to `LONGEST_WAIT`, while older messages still come: the node is behind, or their sender.
-    It does not block. What TF and IMU have sent is taken when a cloud comes or waits.
+    on, up to `LONGEST_WAIT`: the node may be behind, or their sender. It does not block. What TF
+    and IMU have sent is taken when a cloud comes or waits, and read only next to the stamp of a
+    cloud: to read a transform takes ten times as long as to take it.
     """
 
-    def __init__(self, node: Node, config: Config, use: OnCloud) -> None:
+    def __init__(self, node: Node, config: Config, use: Callable[..., None]) -> None:
         self.config = config
         self._node, self._use = node, use
-        self._news: dict[str, tuple[float, float]] = {}  # newest stamp and its arrival [s]
-        self._imu = self._buffer = None
+        self._orientations = Kept()
+        self._transforms: defaultdict[bytes, Kept] = defaultdict(Kept)  # by the names in them
+        self._imu = node.resolve_topic_name('imu') if config.frame.level == 'imu' else ''
+        self._buffer: Any = None
         self._not_yet: Any = ()  # what TF raises
-        self._too_late: Any = ()
-        sources: list[tuple[Any, str, Callable[[bytes], float], QoSProfile]] = []
-        if config.frame.level == 'imu':
-            self._imu = ImuListener(node)
-            sources += [(Imu, 'imu', self._imu.take, BEST_EFFORT)]  # takes from any publisher
+        sources: list[tuple[Any, str, Callable[[bytes], None], QoSProfile]] = []
+        if self._imu:
+            sources += [(Imu, 'imu', self._take_imu, BEST_EFFORT)]  # takes from any publisher
         if (tf2 := find_module('tf2_ros')) is not None:
             self._not_yet, self._too_late = tf2.TransformException, tf2.ExtrapolationException
             # Without the node: given one, the buffer clears itself at jumps of the node's clock,
             # and in some releases raises an error there that ends the executor. See `time_jumped`.
             self._buffer = tf2.Buffer()
-            kind = find_module('tf2_msgs.msg').TFMessage
-            keep = partial(keep_transforms, self._buffer.set_transform, kind)
-            keep_static = partial(keep_transforms, self._buffer.set_transform_static, kind)
-            sources += [(kind, '/tf', keep, RELIABLE), (kind, '/tf_static', keep_static, LATCHED)]
+            self._kind = find_module('tf2_msgs.msg').TFMessage
+            read_static = partial(self._read, is_static=True)
+            sources += [(self._kind, '/tf', self._take_tf, RELIABLE)]
+            sources += [(self._kind, '/tf_static', read_static, LATCHED)]
         group = Unattended()
         self._subscriptions = [
             node.create_subscription(*source, callback_group=group) for source in sources
         ]
-        self._waiting: deque[tuple[float, Header, Callable[[], None]]] = deque()
-        self._held = 0.0  # how long the cloud that is used now was held [s]
-        self._found: CloudFrames | None = None  # what is known of it
+        self._waiting: deque[tuple[float, Header, Callable[[Found], None]]] = deque()
         self._timer = node.create_timer(REVIEW_PERIOD, self._review, clock=STEADY_CLOCK)
         self._timer.cancel()
 
@@ -212,59 +220,59 @@ class FrameListener:
     def _take_all(self) -> None:
         """Take all that TF and IMU have sent."""
         for source in self._subscriptions:
-            newest, now = None, time.monotonic()
             with source.handle:
                 while (taken := source.handle.take_message(source.msg_type, True)) is not None:
-                    newest = source.callback(taken[0])
-            if newest is not None:
-                self._news[source.topic_name] = newest, now
+                    source.callback(taken[0])
+
+    def _take_imu(self, message: bytes) -> None:
+        self._orientations.add(stamp_in(message, CDR_HEADER), message)
+
+    def _take_tf(self, message: bytes) -> None:
+        if names := names_in(message):
+            self._transforms[names].add(stamp_in(message, FIRST_STAMP), message)
+        else:
+            self._read(message)
+
+    def _read(self, message: bytes, is_static: bool = False) -> None:
+        """Give transforms to the buffer of TF."""
+        keep = self._buffer.set_transform_static if is_static else self._buffer.set_transform
+        for transform in deserialize_message(message, self._kind).transforms:
+            keep(transform, 'default_authority')
 
     def _review(self) -> None:
         self._take_all()
         while self._waiting:
             since, header, use = self._waiting[0]
-            if self._has_to_wait(header, since):
+            found = self._find(header, time.monotonic() - since)
+            if found is None:
                 self._timer.reset()
                 return
             self._waiting.popleft()
-            self._held = time.monotonic() - since
-            use()
+            use(found)
         self._timer.cancel()
 
-    def _has_to_wait(self, header: Header, since: float) -> bool:
-        """Return whether the pose at the stamp of a cloud, held `since` then, may still come."""
-        stamp, waited = seconds_of(header.stamp), time.monotonic() - since
-        is_early, self._found = waited < MAX_WAIT, None
-        if is_early and self._imu is not None and self._imu.newest < stamp:
-            return True
-        try:
-            self._found = self._frames_at(header, is_exact=is_early)
-        except self._not_yet:
-            return True
-        except (PointCloudError, ValueError):  # the cloud is refused with the reason
-            return MAX_WAIT <= waited < LONGEST_WAIT and self._is_behind(stamp)
-        return False
+    def _find(self, header: Header, waited: float) -> Found | None:
+        """Return the frames at the stamp of a cloud that has `waited` [s]; None to wait on.
 
-    def _is_behind(self, stamp: float) -> bool:
-        """Return whether messages that are older than the `stamp` of a cloud [s] still come."""
-        soon = time.monotonic() - MAX_WAIT
-        return any(newest < stamp and came > soon for newest, came in self._news.values())
-
-    def look_up(self, header: Header) -> CloudFrames:
-        """Return tilt and place of the sensor at the stamp of the cloud that is used now.
-
-        If TF does not reach the stamp, its newest transform is used. Raises a PointCloudError if a
-        transform or an orientation is missing.
+        If TF does not reach the stamp, its newest transform is used.
         """
-        return (self._found or self._frames_at(header))._replace(waited=self._held)
+        is_early, newest = waited < MAX_WAIT, self._orientations[-1:]
+        if is_early and self._imu and not (newest and newest[0][0] >= stamp_of(header)):
+            return None
+        try:
+            return self._frames_at(header, is_exact=is_early)._replace(waited=waited)
+        except self._not_yet:
+            return None
+        except (PointCloudError, ValueError) as error:  # the cloud is refused with the reason
+            return None if waited < LONGEST_WAIT else error
 
-    def _frames_at(self, header: Header, is_exact: bool = False) -> CloudFrames:
-        tilt, origin, base, ages = None, None, None, [0.0]
-        frame_id, frame, stamp = header.frame_id, self.config.frame, seconds_of(header.stamp)
+    def _frames_at(self, header: Header, is_exact: bool) -> CloudFrames:
+        tilt, origin, base, ages = None, None, None, [0]
+        frame_id, frame, stamp = header.frame_id, self.config.frame, stamp_of(header)
 
         def transform(target: str, source: str, way: str) -> Any:
-            found = self._look_up(target, source, Time.from_msg(header.stamp), way, is_exact)
-            ages.append(abs(stamp - seconds_of(found.header.stamp)))
+            found = self._look_up(target, source, stamp, way, is_exact)
+            ages.append(abs(stamp - stamp_of(found.header)))
             return found.transform
 
         if frame.level == 'tf':
@@ -272,38 +280,66 @@ class FrameListener:
             found = transform(frame.base, frame_id, way)
             base = rotation_of(found.rotation), np.array(_translation_of(found, way))
             tilt = angles_of(base[0][2])
-        elif self._imu is not None:
-            message, off = self._imu.at(stamp)
+        elif self._imu:
+            message, off = self._orientation_at(stamp)
             ages.append(off)
             turn, imu_frame = rotation_of(message.orientation), message.header.frame_id
             if imu_frame != frame_id:
-                way = f'from its frame {frame_id!r} to that of {self._imu.topic}, {imu_frame!r}'
+                way = f'from its frame {frame_id!r} to that of {self._imu}, {imu_frame!r}'
                 turn = turn @ rotation_of(transform(imu_frame, frame_id, way).rotation)
             tilt = angles_of(turn[2])
         if frame.sensor != NO_FRAME:
             way = f'from frame.sensor = {frame.sensor!r} to its frame {frame_id!r}'
             origin = _translation_of(transform(frame_id, frame.sensor, way), way)
-        return CloudFrames(tilt, origin, base, max(ages))
+        return CloudFrames(tilt, origin, base, 1e-9 * max(ages))
 
-    def _look_up(self, target: str, source: str, stamp: Time, way: str, is_exact: bool) -> Any:
+    def _orientation_at(self, stamp: int) -> tuple[Imu, int]:
+        """Return the orientation nearest to the `stamp` of a cloud, and how far it is off [ns].
+
+        Raises a PointCloudError without one that is near.
+        """
+        beside = self._orientations[self._orientations.beside(stamp)]
+        if not beside:
+            raise PointCloudError(f'no message on {self._imu}, for frame.level = imu')
+        off, message = min((abs(own - stamp), message) for own, message in beside)
+        if 1e-9 * off > IMU_TOLERANCE:
+            raise PointCloudError(
+                f'the nearest orientation on {self._imu} is {1e-9 * off:.3g} s from its stamp: '
+                f'must be within {IMU_TOLERANCE:g} s'
+            )
+        imu = deserialize_message(message, Imu)
+        if imu.orientation_covariance[0] == -1.0:
+            raise PointCloudError(
+                f'{self._imu} has no orientation (orientation_covariance[0] is -1): remap imu to '
+                'the output of a filter, such as imu_filter_madgwick'
+            )
+        return imu, off
+
+    def _look_up(self, target: str, source: str, stamp: int, way: str, is_exact: bool) -> Any:
         if self._buffer is None:
             raise PointCloudError(f'transform {way}: needs tf2_ros ({INSTALL_TF2})')
+        # What TF interpolates between; for 0, its newest, any may be needed.
+        for kept in self._transforms.values():
+            for message in kept.read(stamp):
+                self._read(message)
         try:
-            return self._buffer.lookup_transform(target, source, stamp)
+            return self._buffer.lookup_transform(target, source, Time(nanoseconds=stamp))
         except self._not_yet as error:
             if is_exact:
                 raise
-            if isinstance(error, self._too_late) and stamp.nanoseconds:
+            if isinstance(error, self._too_late) and stamp:
                 # The newest: a sensor is fixed to its vehicle.
-                return self._look_up(target, source, Time(), way, is_exact)
+                return self._look_up(target, source, 0, way, is_exact)
             raise PointCloudError(f'no transform {way}: {error}') from error
 
     def time_jumped(self, seconds: float) -> None:
-        """Forget all transforms after a long jump back, also those that were not taken yet."""
+        """Forget all after a long jump back, also what was not taken yet."""
         self._take_all()
-        self._news.clear()
-        if seconds > KEPT_JUMP and self._buffer is not None:
-            self._buffer.clear()
+        if seconds > KEPT_JUMP:
+            self._orientations.clear()
+            self._transforms.clear()
+            if self._buffer is not None:
+                self._buffer.clear()
 
     def close(self) -> None:
         """Stop listening; clouds that wait are dropped."""
@@ -316,20 +352,14 @@ class FrameListener:
 class KeptPose:
     """Pose of the last cloud that showed the ground well, for later clouds in the same frame."""
 
-    def __init__(self) -> None:
-        self._frame = ''
-        self.forget()
-
-    def forget(self) -> None:
-        """Keep no pose, as after the start."""
-        self._pose: SensorPose | None = None
-        self._is_in_use = False
+    _frame = ''
+    _pose: SensorPose | None = None
+    _is_in_use = False
 
     def fallback(self, frame: str) -> SensorPose | None:
         """Return the pose for a cloud in `frame`, or None; that of another frame is forgotten."""
         if frame != self._frame:
-            self._frame = frame
-            self.forget()
+            self._frame, self._pose, self._is_in_use = frame, None, False
         return self._pose
 
     def note(self, pose: SensorPose) -> bool:

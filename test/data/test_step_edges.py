@@ -167,6 +167,7 @@ NO_EDGES = {
         for degrees, at in ((5.0, 8.0), (10.0, 3.0), (10.0, 8.0), (15.0, 3.0), (15.0, 5.0))
         for fall in (0.6, 1.0, 2.0)
     ]),
+    'a narrow view of a ramp': (0.2, [descent(at, 10.2, 1.4) for at in (1.0, 1.5)]),
     'rubble': (0.2, [uneven(1, 0.1, (0.6, 5.0)), 'road_then_rubble']),
     'streets': (0.2, ['urban', 'car_park', 'traffic_jam', 'wet_road']),
     'cars before a lower street': (0.2, [
@@ -183,7 +184,7 @@ OTHERS = [name for name in MOUNTED if name != 'hdl-64e']
     [
         *((kind, 'hdl-64e') for kind in NO_EDGES if kind[:6] not in ('a narr', 'some l')),
         *((kind, name) for kind in [*NO_EDGES][1:3] for name in OTHERS),
-        *((kind, 'vlp-16') for kind in ('rubble', 'streets')),
+        *((kind, 'vlp-16') for kind in ('a narrow view of a ramp', 'rubble', 'streets')),
         ('rubble', 'os1-128'),
         ('a step that is allowed', 'os1-64'),
         ('a narrow trench', 'os1-64'),

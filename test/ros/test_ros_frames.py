@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import importlib.util
 import math
+import struct
 import sys
 import threading
 import time
@@ -117,13 +118,42 @@ def tf(monkeypatch):
     return buffer
 
 
-def test_what_tf_sends_is_kept_and_its_newest_stamp_known(monkeypatch):
-    kept, known = [], [TransformStamped(child_frame_id=name) for name in 'ab']
-    known[0].header.stamp.sec = 7
-    message = types.SimpleNamespace(transforms=known)
-    monkeypatch.setattr(transforms, 'deserialize_message', lambda _raw, _kind: message)
-    assert transforms.keep_transforms(lambda one, _: kept.append(one), None, b'') == 7.0
-    assert kept == known
+def tf_message(stamps, parents, padding=b'\0'):
+    """Message of TF as its bytes, with a transform for each stamp [ns] and its parent."""
+    content = struct.pack('<I', len(stamps))
+    for stamp, parent in zip(stamps, parents, strict=True):
+        content += struct.pack('<iI', *divmod(stamp, 10**9))
+        for name in (parent.encode() + b'\0', b'lidar\0'):
+            content += padding * (-len(content) % 4) + struct.pack('<I', len(name)) + name
+        content += padding * (-len(content) % 8) + struct.pack('<7d', *np.arange(7.0))
+    return b'\0\1\0\0' + content
+
+
+NAMES = st.lists(st.text('abcdefghi', min_size=1), min_size=1, max_size=4)
+
+
+@given(NAMES, st.binary(min_size=1, max_size=1))
+def test_transforms_are_kept_by_their_frames(names, padding):
+    n, key = len(names), transforms.names_in(tf_message([7 * 10**9 + 5] * len(names), names))
+    other = tf_message([3 * 10**9 + 1] * n, names, padding)
+    assert transforms.names_in(other) == key
+    assert transforms.stamp_in(other, transforms.FIRST_STAMP) == 3 * 10**9 + 1
+    for changed in ([*names, 'a'], [names[0] + 'b', *names[1:]]):
+        assert transforms.names_in(tf_message([1] * len(changed), changed)) != key
+    # One whose stamps differ is read at once.
+    assert not transforms.names_in(tf_message([*range(n + 1)], [*names, 'a']))
+
+
+@given(st.lists(st.integers(1, 10**10), min_size=1), st.integers(1, 10**10))
+def test_of_transforms_those_around_a_stamp_are_read_once(stamps, stamp):
+    kept, n_before = transforms.Kept(), sum(own < stamp for own in stamps)
+    for own in stamps:
+        kept.add(own, b'%d' % own)
+    wanted = sorted(stamps)[max(n_before - 1, 0) : n_before + 1]
+    assert [int(message) for message in kept.read(stamp)] == wanted
+    assert not kept.read(stamp) and len(kept.read(0)) == len(stamps) - len(wanted)
+    kept.add(4 * transforms.KEPT_TIME, b'new')
+    assert kept.read(0) == [b'new'] and len(kept) == 1
 
 
 def cloud_of(points, seconds, nanosec=0):
@@ -305,16 +335,25 @@ def test_tilt_by_an_imu_in_another_frame(tf):
 
 @pytest.mark.skipif(not HAS_TF2, reason='tf2_ros is not installed (it has no wheel)')
 def test_tilt_by_real_tf():
-    from tf2_ros import StaticTransformBroadcaster
+    """Between transforms that move, and a part that does not."""
+    from tf2_ros import StaticTransformBroadcaster, TransformBroadcaster
 
     points, turn = turned_street()
-    message = cloud_of(points, 3)
+    message = cloud_of(points, 3, 5 * 10**8)
     with bench({**VALUES, 'frame.level': 'tf'}) as b:
-        broadcaster = StaticTransformBroadcaster(b.probe)
-        known = TransformStamped(child_frame_id='tilted_lidar')
-        known.header.frame_id = 'base_link'
-        known.transform.rotation = quaternion(turn)
-        broadcaster.sendTransform(known)
+
+        def sent(kind, parent, child, matrix, seconds):
+            known = TransformStamped(child_frame_id=child)
+            known.header.frame_id, known.header.stamp.sec = parent, seconds
+            known.transform.rotation = quaternion(matrix)
+            kind.sendTransform(known)
+
+        moving, static = TransformBroadcaster(b.probe), StaticTransformBroadcaster(b.probe)
+        sent(static, 'base_link', 'mount', np.eye(3), 0)
+        wait_for(lambda: moving.pub_tf.get_subscription_count() == 1, 'subscription of /tf')
+        for seconds in range(1, 7):
+            matrix = turn if seconds in (3, 4) else np.eye(3)
+            sent(moving, 'mount', 'tilted_lidar', matrix, seconds)
         # Clouds are refused until it is there; no transform is taken but with a cloud.
         b.publish_until(message, lambda: b.ground.messages, 'ground by TF')
         check_levelled(points, message, (b.ground.messages[0], b.obstacles.wait(1)[0]))
