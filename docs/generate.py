@@ -1,6 +1,7 @@
 """Rewrite config/*.yaml, the page of parameters, and README's scores: `make generate`."""
 
 from pathlib import Path
+from statistics import fmean
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import PRESETS, parameter_specs
@@ -83,15 +84,15 @@ def to_scores_table() -> str:
     row = rows_below(page, 'IoU minus that of ')['all']
     gain = f'{row["difference"]} ({row["95 % interval"]})'
     rows.append(['IoU, vegetation left out', f'{row["IoU"]} %', f'{row["peer IoU"]} %', gain])
-    row = rows_below(page, '## Other sensors')['mean']
-    iou, peer = row['IoU'], row['peer IoU']
-    gain = f'{float(iou) - float(peer):+.2f}'
-    rows.append([f'IoU, {row["scans"]} scans of other sensors', f'{iou} %', f'{peer} %', gain])
+    sensors = [row for row in rows_below(page, '## Other sensors').values() if row['IoU'] != '-']
+    iou, theirs = (fmean(float(row[title]) for row in sensors) for title in ('IoU', 'peer IoU'))
+    title = f'IoU, mean of {len(sensors)} other sensors'
+    rows.append([title, f'{iou:.2f} %', f'{theirs:.2f} %', f'{iou - theirs:+.2f}'])
     classes = rows_below(page, 'Objects: ')
     row = classes['vehicle']
     lost = row['lost'], row['peer lost']
     rows.append([f'vehicles lost, of {row["objects"]}', *lost, judged(*lost)])
-    low = rows_below(page, 'Low things and false cells')['all']
+    low = rows_below(page, 'Low objects and false cells')['all']
     for title, row in {
         f'low objects: called ground, of {low["low returns"]}': low,
         f'vegetation: called ground, of {classes["vegetation"]["returns"]}': classes['vegetation'],

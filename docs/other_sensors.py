@@ -74,18 +74,14 @@ def main(folder: str) -> int:
         '| sensor | scans | IoU | peer IoU | vehicles | lost | peer lost |',
         '| --- | --: | --: | --: | --: | --: | --: |',
     ]
-    shares = []
     for name, sums in of_sensor.items():
         cells = [str(sums['scans']), *'-----']
         if sums['either']:
-            shares.append([100.0 * sums[f'{w}both'] / sums[f'{w}either'] for w in ('', 'peer ')])
-            cells[1:3] = (f'{share:.2f}' for share in shares[-1])
+            shares = (sums[f'{who}both'] / sums[f'{who}either'] for who in ('', 'peer '))
+            cells[1:3] = (f'{100.0 * share:.2f}' for share in shares)
         if sums['vehicles']:
             cells[3:] = (str(sums[key]) for key in ('vehicles', 'lost', 'peer lost'))
         lines.append(f'| {name} | {" | ".join(cells)} |')
-    mean = ' | '.join(f'{share:.2f}' for share in np.mean(shares, axis=0))
-    n_scans = sum(sums['scans'] for sums in of_sensor.values() if sums['either'])
-    lines.append(f'| mean | {n_scans} | {mean} | - | - | - |')
     sys.stdout.write('\n'.join([*lines, '']))
     return 0
 
