@@ -42,7 +42,7 @@ Other scans keep their format and get label (1 ground, 2 obstacle, 0 no return),
 ground_z, ground_std and p_ground. A bag gives a rosbag2 of the ground and the obstacles of each
 cloud.
 
-Begun again with the same words it goes on: an input is left out if its output is newer.
+If it is run again with the same arguments, inputs whose output is newer are skipped.
 
 At the end it prints height and tilt of the sensor, to check or to set (docs/pose.md).
 """
@@ -65,7 +65,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('input', 'scan, folder of scans, bag, or a root', {'metavar': 'INPUT'}),
         ('more', 'further bags', {'metavar': 'BAG', 'nargs': '*', 'default': []}),
         ('-o --output', 'for scans a folder, or a file for a single scan; for bags a folder, or '
-         'a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
+         'a .mcap or .db3 file (default: INPUT with _ground added, next to it)',
          {'metavar': 'OUT'}),
         ('--format', 'of a file for each scan or cloud (default: by the name of OUT, else labels '
          f'of .bin scans, and as the input): {", ".join(FORMATS)}',

@@ -271,7 +271,7 @@ def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner =
 
 
 def measure_speed(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Report:
-    """Time each frame by stage, beside Patchwork++ on the same frame.
+    """Time each frame by stage, and Patchwork++ on the same frame.
 
     With theta learned in every frame and with theta fixed, by the backend of the parameters and
     by numpy. Each method takes one thread. Reading is left out. The ratio to Patchwork++ is taken
@@ -317,7 +317,7 @@ def score_scenes(
     """Score simulated scans by exact labels and heights, and count objects lost, low ones too.
 
     An object is lost if more than half of its returns from 0.3 m above the ground are called
-    ground; returns on low objects count from 0.1 m on. Patchwork++ beside it has its published
+    ground; returns on low objects count from 0.1 m on. Patchwork++ has its published
     parameters and the true height and place of the sensor. All sensors have one set of
     parameters. Low objects, and rough and steep ground, have tables of their own.
     """
