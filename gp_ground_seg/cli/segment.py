@@ -65,7 +65,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('input', 'scan, folder of scans, bag, or a root', {'metavar': 'INPUT'}),
         ('more', 'further bags', {'metavar': 'BAG', 'nargs': '*', 'default': []}),
         ('-o --output', 'for scans a folder, or a file for a single scan; for bags a folder, or '
-         'a .mcap or .db3 file (default: INPUT with _ground added, next to it)',
+         'a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
          {'metavar': 'OUT'}),
         ('--format', 'of a file for each scan or cloud (default: by the name of OUT, else labels '
          f'of .bin scans, and as the input): {", ".join(FORMATS)}',
