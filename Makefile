@@ -1,6 +1,6 @@
 # make demo | make test | make test-all | make browser-test | make bench | make node-bench | make colcon | make dist | make lint | make docs: each creates the environment it needs.
 PYTHON ?= python3
-# Not the .venv of README: two ways of installation in one environment get in each other's way.
+# Not the .venv of README, which is without ROS.
 VENV ?= .venv-dev
 BIN := $(VENV)/bin
 KITTI ?= $(abspath $(wildcard ../shared/kitti))
