@@ -1,6 +1,6 @@
 # make demo | make test | make test-all | make browser-test | make bench | make node-bench | make colcon | make dist | make lint | make docs: each creates the environment it needs.
 PYTHON ?= python3
-# Not the .venv of README: two ways of installation in one environment get in each other's way.
+# Not the .venv of README, which is without ROS.
 VENV ?= .venv-dev
 BIN := $(VENV)/bin
 KITTI ?= $(abspath $(wildcard ../shared/kitti))
@@ -15,7 +15,7 @@ help:
 	@echo 'make test-all  all tests'
 	@echo 'make browser-test  the page of tune in a headless Chromium, which root gets by apt'
 	@echo 'make torture   hostile clouds, files and messages (TORTURE_SCALE=100 for a night)'
-	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
+	@echo 'make bench     time per frame by stage, and of Patchwork++ (needs KITTI=PATH)'
 	@echo 'make figures   every table and picture of README and docs anew (needs KITTI=PATH; ONLY=word for some)'
 	@echo 'make docs      the documentation as HTML, in build/docs'
 	@echo 'make node-bench  latency and losses of the node over DDS'

@@ -17,7 +17,7 @@ picture: FILE -> PATH  the file that the command makes, and its place in the rep
 
 A command is one of gp-ground-seg, or a Python script: docs/faults.py.
 
-Rows and columns without a number are left out: - is none, and 0 is none beside it. A page has one
+Rows and columns without a number are left out: - is no number, nor is 0 next to it. A page has one
 line on the machine, below its last tables; above each figure is its commit.
 
 Pages and pictures are written when all commands have run: each runs on the commit it names.

@@ -1,7 +1,7 @@
 """Print the nearest obstacle of each cloud that the node publishes.
 
-Beside `gp-ground-seg node --ros-args -r points:=YOUR_TOPIC -p output.min_height:=0.2`, start
-this with -r /obstacles:=NAME if the node has a namespace.
+While `gp-ground-seg node --ros-args -r points:=YOUR_TOPIC -p output.min_height:=0.2`
+runs, start this; with --ros-args -r obstacles:=/NAMESPACE/obstacles if the node has a namespace.
 """
 
 import numpy as np

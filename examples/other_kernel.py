@@ -1,7 +1,7 @@
 """Fit a kernel of scikit-learn to our inliers, segment by segment: SCAN [PRESET].
 
-Both surfaces rest on the same inliers and are compared at the same ranges; neither is the truth.
-Put a kernel of your own into KERNEL.
+Needs scikit-learn (`pip install scikit-learn`). Both surfaces are fitted to the same inliers and
+compared at the same ranges; neither is the truth. Put your own kernel into KERNEL.
 """
 
 import sys

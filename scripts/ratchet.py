@@ -34,7 +34,7 @@ def count(root: Path) -> dict[str, int]:
 
 
 def main() -> int:
-    """Print each count beside its limit; return 1 if one is above, or has no limit."""
+    """Print each count and its limit; return 1 if one is above, or has no limit."""
     root = Path(__file__).resolve().parent.parent
     limits = tomllib.loads((root / 'pyproject.toml').read_text())['tool']['ratchet']
     code = 0

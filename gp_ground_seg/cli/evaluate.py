@@ -42,13 +42,13 @@ DESCRIPTION = """\
 Segment labelled frames and score the labels in the GroundGrid convention, which leaves
 vegetation out: precision, recall, IoU, heights, time per frame. Count the vehicles, persons and
 cyclists that are lost: of their returns from 0.3 m above the ground more than half are called
-ground. Objects are the instances of the labels (their upper 16 bits). Count low things, which
+ground. Objects are the instances of the labels (their upper 16 bits). Count low objects, which
 are objects cut at --cut, and false cells, where ground is taken for an obstacle. docs/accuracy.md
 says how. The last line is the result.
 
 With --against a second set of parameters, or with --peer Patchwork++, runs in turns on the same
 frames. Each difference has a bootstrap interval over the sequences, or over blocks of frames of
-a single one; in a tie it holds 0. With --against, ROOT may also be scans without labels, such
+a single one; in a tie 0 is in it. With --against, ROOT may also be scans without labels, such
 as a folder or a bag: the tables have the points with two labels, and the time.
 
 Patchwork++ has its published parameters, and the height and the place of the sensor where they
@@ -82,8 +82,8 @@ OF_FRAMES = (
 )
 CUT = (
     '--cut',
-    f'height [m] at which objects are cut, to count low things (default: {CUT_HEIGHT}); '
-    '0 = no low things: each method segments a frame once',
+    f'height [m] at which objects are cut, to count low objects (default: {CUT_HEIGHT}); '
+    '0 = no low objects: each method segments a frame once',
     {'metavar': 'HEIGHT', 'type': partial(options.above_zero, or_zero=True)},
 )
 

@@ -42,7 +42,7 @@ Other scans keep their format and get label (1 ground, 2 obstacle, 0 no return),
 ground_z, ground_std and p_ground. A bag gives a rosbag2 of the ground and the obstacles of each
 cloud.
 
-Begun again with the same words it goes on: an input is left out if its output is newer.
+If it is run again with the same arguments, inputs whose output is newer are skipped.
 
 At the end it prints height and tilt of the sensor, to check or to set (docs/pose.md).
 """

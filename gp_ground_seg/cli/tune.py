@@ -1,4 +1,4 @@
-"""``tune``: parameters by sliders, and the labels of a scan beside them."""
+"""``tune``: parameters by sliders, and the labels of a scan next to them."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from gp_ground_seg.lab.tuner import Tuner, open_server, tunable
 DESCRIPTION = """\
 Show a scan in the browser, with sliders for the parameters. Labels follow at once,
 and points that change their class have a colour. With labels of SemanticKITTI, IoU and objects
-lost are shown too. A button writes the parameters as YAML, and a line tells how to load the file
-into a running node. The page is served to this machine only. Ctrl-C stops it.
+lost are shown too. A button writes the parameters as YAML, and shows the command that loads the
+file into a running node. The page is served to this machine only. Ctrl-C stops it.
 """
 EXAMPLES = """\
   gp-ground-seg tune 000000.bin
@@ -36,7 +36,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add(
         parser,
         ('input', 'scan, folder of scans, sequence or bag', {'metavar': 'INPUT'}),
-        ('--labels', 'SemanticKITTI labels of a scan (default: those beside it)', file),
+        ('--labels', 'SemanticKITTI labels of a scan (default: those next to it)', file),
         ('--frame', 'number of the first frame to show, from 0',
          {'metavar': 'N', 'type': int, 'default': 0}),
         ('--port', 'of the page, or the next free one (default: %(default)s)',

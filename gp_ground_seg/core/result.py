@@ -117,23 +117,22 @@ class Segmentation:
     `surface` are intermediate results, for plots and diagnostics, in the level frame.
     """
 
-    #: labels and what they follow from, heights over `surface` among it; `label` and `margin` are
-    #: taken from it
+    #: labels, and what decides them: heights over `surface`, margins
     labelled: Labelled
     timings: dict[str, float]  #: seconds per stage, and ``total``
     learned: Learned  #: outcome of the learning; `fit` sums it up
     backend: str  #: ``numba`` or ``numpy``
     grid: PolarGrid  #: cell of each point
     frame: Frame  #: what the processes are fitted to
-    #: the process's own surface, which the labels follow from; `corrected` is what users are given
+    #: the surface of the process, which decides the labels; `height` comes from `corrected`
     surface: GroundSurface
     #: (M, K) log length-scale at the K knots of the surface [log m]; NaN in segments without
     #: candidates
     log_length_scale: FloatArray
-    #: height and tilt of the sensor that were used, and what the scan says of them;
+    #: height and tilt of the sensor that were used, and what the scan shows of them;
     #: ``pose.level(xyz)`` gives points in the level frame
     pose: SensorPose
-    relief: Relief  #: height of the terrain in plan, over which those of `frame` and `surface` are
+    relief: Relief  #: height of the terrain in plan; those in `frame` and `surface` are over it
     z: PointArray  #: (N,) height of each point in the sensor frame [m]
     config: Config  #: parameters of the frame (those given, with narrower gates for a low sensor)
 
@@ -161,8 +160,8 @@ class Segmentation:
     def label(self) -> npt.NDArray[np.uint8]:
         """`gp_ground_seg.Label` of each point, (N,) uint8.
 
-        Returns are GROUND or OBSTACLE; where there is no model nothing speaks for ground, and
-        they are OBSTACLE. Points that are not finite, or exactly at the sensor, are UNKNOWN.
+        Returns are GROUND or OBSTACLE, and OBSTACLE where there is no model. Points that are not
+        finite, or exactly at the sensor, are UNKNOWN.
         """
         return self.labelled.label
 
@@ -238,7 +237,7 @@ class Segmentation:
 
     @cached_property
     def corrected(self) -> CorrectedSurface:
-        """The ground without the bias of lowest points, as uncertain as its residuals say.
+        """The ground without the bias of lowest points; its deviations are from its residuals.
 
         See `gp_ground_seg.core.pipeline.residuals.correct_surface`. The relief is that in the
         middle of each segment.
@@ -280,9 +279,9 @@ class Segmentation:
     def return_std(self) -> FloatArray:
         """Standard deviation of the height of a ground return, (N,) float64 [m].
 
-        About `ground_z`: surface, roughness and range noise together. NaN without a model. Some
-        errors are so large that their root mean square is too wide for the others: that is scaled
-        until as many returns called ground are within it as of a normal distribution.
+        About `ground_z`: surface, roughness and range noise together. NaN without a model. A few
+        large errors make their root mean square too wide: it is scaled until as many returns
+        called ground are within it as in a normal distribution.
         """
         rms, own = self._at_points(self.corrected.return_rms), self.is_ground
         errors = np.abs(self.height[own]) / rms[own]

@@ -271,7 +271,7 @@ def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner =
 
 
 def measure_speed(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Report:
-    """Time each frame by stage, beside Patchwork++ on the same frame.
+    """Time each frame by stage, and Patchwork++ on the same frame.
 
     With theta learned in every frame and with theta fixed, by the backend of the parameters and
     by numpy. Each method takes one thread. Reading is left out. The ratio to Patchwork++ is taken
@@ -314,12 +314,12 @@ COUNTED = {'vehicles': ('vehicle',), 'persons': ('person', 'cyclist')}
 def score_scenes(
     frames: Sequence[SimulatedFrame], config: Config, runner: Runner = HERE
 ) -> Report:
-    """Score simulated scans by exact labels and heights, and count objects and low things lost.
+    """Score simulated scans by exact labels and heights, and count objects lost, low ones too.
 
     An object is lost if more than half of its returns from 0.3 m above the ground are called
-    ground; returns on low things count from 0.1 m on. Patchwork++ beside it has its published
+    ground; returns on low objects count from 0.1 m on. Patchwork++ has its published
     parameters and the true height and place of the sensor. All sensors have one set of
-    parameters. Low things, and rough and steep ground, have tables of their own.
+    parameters. Low objects, and rough and steep ground, have tables of their own.
     """
     methods: list[Method] = [OurMethod(config), PatchworkppMethod()]
     scores = score_methods(frames, methods, load_scan, each_alone=True, runner=runner)
@@ -361,9 +361,9 @@ def _low_table(scores: Scores) -> Table:
     shares = ratio(by_class['n_lost'], by_class['n_objects']).unstack('class')
     things = sums(low, 'sequence')['n_objects'].to_frame('things')
     found = things.join(shares.reindex(columns=[*LOW_CLASSES]))
-    title = 'Low things by height, in plain view 3 to 20 m away, and the share that is lost [%]'
+    title = 'Low objects by height, in plain view 3 to 20 m away, and the share that is lost [%]'
     forms = {name: Form(name.removeprefix('low, '), '.0f', 100.0) for name in LOW_CLASSES}
-    forms['things'] = Form('things', *COUNT)
+    forms['things'] = Form('objects', *COUNT)
     return Table(title + peer_note(scores), _placed(beside(found, scores)), forms)
 
 

@@ -1,4 +1,4 @@
-"""The paper's Table I, measured on segments of labelled frames beside its printed values."""
+"""The paper's Table I, measured on segments of labelled frames next to its printed values."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ names no frames."""
 
 
 def table1(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Report:
-    """Measure the paper's Table I on segments of labelled frames, beside its printed values.
+    """Measure the paper's Table I on segments of labelled frames, next to its printed values.
 
     P. Mehrabi and H. D. Taghirad, "A Novel Gaussian Process Based Ground Segmentation Algorithm
     with Local-Smoothness Estimation", arXiv 2112.05847. With the parameters given (ours), and

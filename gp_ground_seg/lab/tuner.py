@@ -51,7 +51,7 @@ LEGENDS = {
 
 
 def read_view(item: Input, labels: str | None = None) -> KnownScan:
-    """Read a scan, and its labels: a file, or what SemanticKITTI has beside the scan."""
+    """Read a scan, and its labels: a file, or that of SemanticKITTI next to it."""
     points, path = item.read().xyz, labels
     beside = item.path.parent.parent / 'labels' / f'{item.name}.label'
     if path is None and item.path.parent.name == 'velodyne' and beside.exists():
@@ -89,8 +89,8 @@ LAST_PORT = 64_535
 def open_server(port: int) -> Iterator[tuple[Any, str]]:
     """Yield viser's server on this machine, and the address of its page; port 0 is any free one.
 
-    If the port is in use, the next free one is taken and logged. Who does not know the address
-    gets no answer. It prints nothing.
+    If the port is in use, the next free one is taken and logged. A request without the
+    address gets no answer. It prints nothing.
     """
     viser, token = require('viser', 'viser'), secrets.token_urlsafe()
     if port > LAST_PORT:

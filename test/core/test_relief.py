@@ -12,7 +12,7 @@ from gp_ground_seg import Config
 from gp_ground_seg.core.frame import Candidates, Faces
 from gp_ground_seg.core.pipeline.relief import N_SIDES, Relief
 
-HEIGHT, N_TILES = 1.8, 50
+HEIGHT, N_TILES = 1.8, 10_000
 MIDDLES = 2.0 * np.arange(N_SIDES) - 59.0
 NO_FACES = Faces(*np.zeros((3, N_TILES), dtype=bool))
 
@@ -31,7 +31,7 @@ def candidates_on(height, ranges, n_segments=180, seed=0, share=1.0, spread=0.3)
     )
     x, y = r * np.cos(azimuth), r * np.sin(azimuth)
     offsets = np.concatenate([[0], np.cumsum(np.bincount(segment, minlength=n_segments))])
-    tile = rng.integers(0, N_TILES, len(r)).astype(np.int32)
+    tile = np.arange(len(r), dtype=np.int32)  # one for each, unless a test has others
     z = height(x, y) - HEIGHT
     return Candidates(r, z, np.arange(len(r)), np.ones(len(r)), offsets, tile, x, y)
 
@@ -138,6 +138,54 @@ def test_no_relief_is_what_cannot_be_climbed(backend, name, share):
     assert relief.is_level
     assert over is candidates
     assert (relief.at(np.array([0.0, 9.0]), np.array([0.0, 3.0])) == 0.0).all()
+
+
+STANDING = {
+    'bed': (box(6.0, 10.0, -4.0, 4.0, 0.5), True),
+    'truck': (LEVEL_TERRAIN['truck'], True),
+    'pallets': (LEVEL_TERRAIN['pallets'], False),
+    'post': (box(6.0, 6.6, -0.2, 0.2, 0.9), False),
+    'terrace': (LEVEL_TERRAIN['terrace'], False),
+    'bank': (bank(25, 10.0), False),
+}
+
+
+@pytest.mark.parametrize('name', STANDING)
+def test_what_stands_on_the_ground_has_ground_before_and_behind_it(backend, name):
+    terrain, stands = STANDING[name]
+    candidates = candidates_on(terrain, np.arange(3.0, 20.0, 0.4))
+    faces = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())[2]
+    over = candidates.z + HEIGHT
+    expected = (over > 0.3) & stands
+    np.testing.assert_array_equal(faces.is_face[: len(over)], expected)
+    assert not NO_FACES.is_face.any()
+
+
+@pytest.mark.parametrize(('is_steep', 'stands'), [(False, False), (True, True)])
+def test_no_way_leads_over_returns_that_are_too_steep(backend, is_steep, stands):
+    """A plateau that can be climbed, were it not for the returns at its foot."""
+
+    def terrain(x, y):
+        inside = np.minimum(x - 6.0, 3.0 - np.abs(y))
+        return np.clip(0.8 * inside, 0.0, 0.5) * (x < 9.0)
+
+    candidates = candidates_on(terrain, np.arange(3.0, 20.0, 0.4))
+    over = candidates.z + HEIGHT
+    steep = np.zeros(N_TILES, dtype=np.bool_)
+    steep[: len(over)] = is_steep & (over > 0.0) & (over < 0.5)
+    faces = NO_FACES._replace(is_steep=steep)
+    found = backend.find_relief(candidates, faces, HEIGHT, Config())[2]
+    assert (found.is_face[: len(over)][over == 0.5] == stands).all()
+
+
+def test_a_tile_with_lower_candidates_is_not_marked(backend):
+    candidates = candidates_on(STANDING['bed'][0], np.arange(3.0, 20.0, 0.4))
+    shared = candidates._replace(tile=candidates.tile // 2)
+    found = backend.find_relief(shared, NO_FACES, HEIGHT, Config())[2].is_face
+    stands = candidates.z + HEIGHT > 0.3
+    both = stands[: len(stands) // 2 * 2].reshape(-1, 2).all(axis=1)
+    assert both.any()
+    np.testing.assert_array_equal(found[: len(both)], both)
 
 
 def test_without_ground_near_the_sensor_there_is_no_relief(backend):

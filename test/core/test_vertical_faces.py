@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 from conftest import BACKENDS, fewer
@@ -52,6 +54,20 @@ def test_returns_above_one_place_have_no_direction(backend):
         above = [[x, place, z] for z in (0.5, 0.52, 0.55)]
         is_face, is_occluded, _ = faces_of(backend, CORNER + np.vstack([foot, above]))
         assert is_face.all() and not is_occluded.any()
+
+
+@pytest.mark.parametrize(('degrees', 'is_steep'), [(35, False), (45, True), (75, True)])
+@pytest.mark.parametrize('foliage', [0.0, 0.02])
+def test_what_is_too_steep_for_terrain(backend, degrees, is_steep, foliage):
+    """Foliage scatters the returns along the beams, which changes their slope little."""
+    rng = np.random.default_rng(degrees)
+    slope = math.tan(math.radians(degrees))
+    z = rng.uniform(0.0, 0.4 * min(slope, 1.0), 200)
+    x = np.minimum(z / slope + foliage * rng.exponential(size=200), 0.49)
+    xyz = np.column_stack([x, rng.uniform(0.01, 0.49, 200), z])
+    scan = backend.build_grid(CORNER + xyz, BASE)
+    faces = backend.find_faces(scan, 0.0, BASE)
+    assert (faces.is_steep[scan.tiles.tile] == is_steep).all()
 
 
 def test_a_face_below_an_edge_shows_no_ground(backend):

@@ -104,7 +104,7 @@ def test_of_a_single_sequence_blocks_of_successive_frames_are_drawn():
     ])  # fmt: skip
     parts = {name: own.tolist() for name, own in clusters(scores).groupby('cluster')['index']}
     assert parts == {'kerb 0': ['0', '3'], 'kerb 1': ['1', '4'], 'kerb 2': ['2', '5']}
-    assert 'bootstrap over 3 scenes, which are few' in interval_note(scores)
+    assert 'bootstrap over 3 scenes (few: too narrow)' in interval_note(scores)
     assert 'few' not in interval_note(scores_of(a=sequences_of(*range(20))))
 
 
@@ -130,7 +130,7 @@ DIFFERENCES = {
     'recall [%]': (0.92, 0.85, '+5.00 to +9.00'),
     'returns on objects called ground [%]': (16 / 20, 30 / 20, '-90.00 to -50.00'),
     'objects lost [%]': (2 / 8, 0.0, '+25.00 to +25.00'),
-    'returns on low things called ground [%]': (0.16, 0.3, '-18.00 to -10.00'),
+    'returns on low objects called ground [%]': (0.16, 0.3, '-18.00 to -10.00'),
     'RMSE of the height [cm]': (np.sqrt(0.12 / 4), np.sqrt(0.05 / 4), '-5.81 to +22.36 tie'),
     'heights within 1 std, ideally 68.3 [%]': (0.75, 0.75, '-50.00 to +50.00 tie'),
 }

@@ -21,6 +21,7 @@ figures = load_script('docs/figures.py')
 
 PAGES = [*figures.PAGES, 'CONTRIBUTING.md', 'docs/scans/README.md']
 TEXTS = {page: (REPOSITORY / page).read_text(encoding='utf-8') for page in PAGES}
+SOURCES = ''.join(p.read_text() for p in REPOSITORY.glob('[glt]*/**/*.py'))
 FIGURES = [figure for page in PAGES for figure in figures.find_figures(page, TEXTS[page])]
 SAMPLED = [figure for figure in FIGURES if figure.sample]
 # That of the demo shows a scan that depends on the time.
@@ -43,7 +44,7 @@ OURS = re.compile(
 )
 """Accuracy and speed, which are in figures, with their command."""
 ODD = re.compile(
-    r'\b(of which|beside|aside|told|things?|the cloud before|holds? for|go(es)? on)\b'
+    r'\b(of which|beside|aside|told|things?|the cloud before|holds? for|go(es)? on|whoever)\b'
 )
 """For: such as, next to, given, object, the previous cloud, applies to, continue."""
 NOT_OURS = re.compile(
@@ -96,6 +97,8 @@ def faults(page, text):
     yield from (f'figure in a sentence: {k[0]}' for k in OURS.finditer(NOT_OURS.sub('', prose)))
     yield from (f'odd word: {k[0]}' for k in ODD.finditer(prose))
     yield from (f'{link}: no such place' for link in LINK.findall(text) if is_broken(page, link))
+    names = re.findall(r'`(\w+)`', text) if page == 'CONTRIBUTING.md' else []
+    yield from (f'{name}: in no source' for name in names if name not in SOURCES)
     lines = ''.join(commands_of(text)).splitlines()
     yield from (f'{line}: is refused' for line in lines if is_refused(line))
 

@@ -14,15 +14,6 @@ pytestmark = pytest.mark.slow
 NOT_OF_A_NEWCOMER = ('MAKE', 'MFLAGS', 'VENV', 'VIRTUAL_ENV', 'PYTHON', 'PYTEST', 'GP_GROUND_SEG')
 
 
-# All tests would take minutes, and run in the checkout.
-SOME_TESTS = {'PYTEST_ADDOPTS': 'test/data test/repo'}
-
-
-def newcomer() -> dict[str, str]:
-    own = {k: v for k, v in os.environ.items() if not k.startswith(NOT_OF_A_NEWCOMER)}
-    return {**own, **SOME_TESTS}
-
-
 def try_it(language: str) -> list[str]:
     """The blocks of a language of README's section "Try it"."""
     section = (REPOSITORY / 'README.md').read_text().split('\n## Try it\n')[1].split('\n## ')[0]
@@ -30,9 +21,12 @@ def try_it(language: str) -> list[str]:
 
 
 def run(script: str, folder: Path) -> str:
+    own = {k: v for k, v in os.environ.items() if not k.startswith(NOT_OF_A_NEWCOMER)}
+    # All tests would take minutes, and run in the checkout.
     try:
         done = subprocess.run(
-            ['bash', '-e', '-c', script], cwd=folder, env=newcomer(), stdin=subprocess.DEVNULL,
+            ['bash', '-e', '-c', script], cwd=folder, stdin=subprocess.DEVNULL,
+            env={**own, 'PYTEST_ADDOPTS': 'test/data test/repo'},
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=1200,
         )  # fmt: skip
     except subprocess.TimeoutExpired as late:

@@ -68,7 +68,7 @@ class MeasuredPose:
 
 @dataclass(frozen=True)
 class SensorPose:
-    """Where the sensor was taken to be; the level frame has its origin and heading."""
+    """The pose of the sensor that was used; the level frame has its origin and heading."""
 
     height: float  #: of the cloud's origin above the ground near it, negative below it [m]
     #: fixed-axis angles that turn the sensor frame level, as those of a URDF [rad]: positive roll
@@ -85,7 +85,7 @@ class SensorPose:
     is_height_default: bool = False  #: whether the height is neither given nor shown by the scan
     #: why a height that comes from this scan may be wrong, a line for each
     doubts: tuple[str, ...] = ()
-    #: whether what is not given, and `measured`, are those of an earlier scan
+    #: whether `measured`, and the values that are not given, come from an earlier scan
     is_fallback: bool = False
     #: place of the sensor in the frame of the cloud, if it was given [m]
     origin: Direction = (0.0, 0.0, 0.0)

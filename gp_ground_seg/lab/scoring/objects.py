@@ -48,7 +48,7 @@ LOW_MIN_HEIGHT, LOW_MIN_RETURNS = 0.1, 3
 CELLS = {'road_cells': (40, 44), 'ground_cells': (40, 44, 48, 49, 60)}
 """Classes of SemanticKITTI whose cells are counted."""
 SHARES = {
-    'low_things': 'returns on low things called ground',
+    'low_things': 'returns on low objects called ground',
     'road_cells': 'cells of road called obstacle',
     'ground_cells': 'cells of ground called obstacle',
 }

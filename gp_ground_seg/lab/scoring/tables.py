@@ -122,8 +122,8 @@ def interval_note(scores: Scores) -> str:
     kind = 'sequences' if names == {*scores.sequences} else 'scenes'
     if scores.scans['cluster'].nunique() == 1:
         kind = 'blocks of successive frames'
-    few = ', which are few: rough, and rather too narrow' * (n < FEW)
-    return f'95 % interval: bootstrap over {n} {kind}{few}; tie: it holds 0'
+    few = ' (few: too narrow)' * (n < FEW)
+    return f'95 % interval: bootstrap over {n} {kind}{few}; tie: 0 is in it'
 
 
 def beside(found: DataFrame, scores: Scores) -> DataFrame:
@@ -187,7 +187,7 @@ def evaluation(scores: Scores, config: Config) -> Report:
             scores.scans, 'sequence', ['n_scans', *metrics.LABEL_MEASURES],
         )  # fmt: skip
         tables['low_things'] = _grouped(
-            scores, 'Low things and false cells [%]', scores.scans, 'sequence',
+            scores, 'Low objects and false cells [%]', scores.scans, 'sequence',
             [column for name in objects.SHARES for column in (f'{name}_n', name)],
         )  # fmt: skip
         tables['heights'] = _grouped(
