@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import statistics
-from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from itertools import chain
@@ -34,7 +33,7 @@ DESCRIPTION = """\
 Split scans into ground and obstacles.
 
 INPUT is a scan (.bin .pcd .ply .npy .npz), a folder or sequence of scans, a bag
-(.bag .mcap .db3, or a rosbag2 folder), several bags, or a KITTI_ROOT. docs/datasets.md has more
+(.bag .mcap .db3, or a rosbag2 folder), or a KITTI_ROOT. docs/datasets.md has more
 on formats, and on whole data sets.
 
 A .bin gives a .label file: 40 = ground, 99 = obstacle, 0 = no return (SemanticKITTI).
@@ -59,13 +58,13 @@ EXAMPLES = """\
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
     parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
-    parser.usage = '%(prog)s INPUT [BAG ...] [-o OUT] [options]'
+    parser.usage = '%(prog)s INPUT [-o OUT] [options]'
     options.add(
         parser,
         ('input', 'scan, folder of scans, bag, or a root', {'metavar': 'INPUT'}),
-        ('more', 'further bags', {'metavar': 'BAG', 'nargs': '*', 'default': []}),
-        ('-o --output', 'for scans a folder, or a file for a single scan; for bags a folder, or '
-         'a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
+        ('more', argparse.SUPPRESS, {'nargs': '*', 'default': []}),
+        ('-o --output', 'for scans a folder, or a file for a single scan; for a bag a folder, '
+         'or a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
          {'metavar': 'OUT'}),
         ('--format', 'of a file for each scan or cloud (default: by the name of OUT, else labels '
          f'of .bin scans, and as the input): {", ".join(FORMATS)}',
@@ -81,6 +80,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the files of each input that are not written yet, and print a summary."""
+    if arguments.more:
+        raise DataError(
+            f'{arguments.more[0]}: a second input, where one is taken; for several: '
+            'for f in FILES; do gp-ground-seg segment "$f"; done'
+        )
     config = options.read_config(arguments)
     target = Path(arguments.output or _default_output(Path(arguments.input), arguments.format))
     items, is_one = _list_items(arguments, target)
@@ -109,8 +113,6 @@ def run(arguments: argparse.Namespace) -> int:
 def _list_items(arguments: argparse.Namespace, target: Path) -> tuple[list[Item], bool]:
     """List what to segment, and say whether `target` is the one file or bag that it becomes."""
     source, form = Path(arguments.input), arguments.format
-    if arguments.more:
-        return _list_bags(arguments), False
     if holds_bag(source) and form is None:
         return [Item(options.list_clouds(arguments), [target.name], to_bag=True)], True
     if is_root(source):
@@ -148,25 +150,10 @@ def _list_root(arguments: argparse.Namespace) -> list[Item]:
     return items
 
 
-def _list_bags(arguments: argparse.Namespace) -> list[Item]:
-    """List several bags, each of which becomes one in the output folder."""
-    options.refuse(arguments, ['format'], 'is for scans, or for one bag')
-    paths = [Path(source) for source in (arguments.input, *arguments.more)]
-    for path in paths:
-        if not holds_bag(path):
-            raise DataError(f'{path}: is no bag, of several inputs each must be one')
-    names = [_default_output(path).name for path in paths]
-    ((name, n_bags),) = Counter(names).most_common(1)
-    if n_bags > 1:
-        raise DataError(f'two of the bags would become {name}')
-    items = zip(paths, names, strict=True)
-    return [Item(options.list_clouds(arguments, p), [name], to_bag=True) for p, name in items]
-
-
 def _parameters(arguments: argparse.Namespace, config: Config) -> str:
     """Return what the files of an output folder depend on, beside the content of the inputs."""
     source = Path(arguments.input).resolve()
-    if arguments.more or not (source.is_dir() or holds_bag(source)):
+    if not (source.is_dir() or holds_bag(source)):
         source = source.parent  # the same names from elsewhere are other inputs
     title = f'written by gp-ground-seg segment {__version__}, from {source}'
     for name in 'topic', 'columns':
