@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import statistics
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -15,18 +16,18 @@ from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.data.bags import BAG_SUFFIXES
-from gp_ground_seg.data.cloud_files import FORMATS, LABELS, format_for
+from gp_ground_seg.data.cloud_files import FORMATS, LABELS
 from gp_ground_seg.data.files import write_file
 from gp_ground_seg.data.inputs import Inputs, holds_bag
 from gp_ground_seg.data.semantic_kitti import is_root, list_sequences
 from gp_ground_seg.lab.dataset import (
     PARAMETERS,
-    Item,
     Outcome,
-    count_clouds,
     find_difference,
     find_left,
-    segment_block,
+    output_of,
+    segment_bag,
+    segment_scans,
 )
 
 DESCRIPTION = """\
@@ -85,69 +86,61 @@ def run(arguments: argparse.Namespace) -> int:
             f'{arguments.more[0]}: a second input, where one is taken; for several: '
             'for f in FILES; do gp-ground-seg segment "$f"; done'
         )
-    config = options.read_config(arguments)
-    target = Path(arguments.output or _default_output(Path(arguments.input), arguments.format))
-    items, is_one = _list_items(arguments, target)
+    config, source = options.read_config(arguments), Path(arguments.input)
+    target = Path(arguments.output or _default_output(source, arguments.format))
+    scans, form, is_one = _list_scans(arguments, source, target)
     if not is_one and (target.is_file() or target.suffix[1:] in FORMATS):
         raise DataError(f'{target}: must be a folder')
     folder, place = (target.parent, target) if is_one else (target, target.resolve())
     if not place.parent.is_dir():
         raise DataError(f'{target}: the folder {place.parent} does not exist')
+    outputs = [target] if is_one else [output_of(folder, form, scan) for scan in scans]
     parameters = None if is_one else _parameters(arguments, config)
-    left = find_left(folder, items, parameters, force=arguments.force)
-    if len(left) < len(items):
-        print(f'{len(items) - len(left)} of {len(items)} were finished before')
+    left = find_left(scans, outputs, folder, parameters, force=arguments.force)
+    if len(left) < len(scans):
+        print(f'{len(scans) - len(left)} of {len(scans)} were finished before')
     if not left:
         return 0
-    used = options.spare_compiling(config, count_clouds(left))
+    used = options.spare_compiling(config, len(left))
+    write = partial(segment_scans, folder, form, used)
+    if is_one and scans.topic:
+        write = partial(segment_bag, target, used)
     with options.runner(arguments, 'segment') as runner:
         if parameters and (arguments.force or find_difference(folder, parameters)):
             write_file(folder / PARAMETERS, parameters.encode())
-        found = runner.run(partial(segment_block, folder, used), left, size_of=count_clouds)
+        found = runner.run(write, left)
     _print_summary([*chain(*found)], target, runner.n_workers)
     if not arguments.quiet:
         options.note_spared(config, used)
     return 0
 
 
-def _list_items(arguments: argparse.Namespace, target: Path) -> tuple[list[Item], bool]:
-    """List what to segment, and say whether `target` is the one file or bag that it becomes."""
-    source, form = Path(arguments.input), arguments.format
-    if holds_bag(source) and form is None:
-        return [Item(options.list_clouds(arguments), [target.name], to_bag=True)], True
+def _list_scans(
+    arguments: argparse.Namespace, source: Path, target: Path
+) -> tuple[Inputs, str | None, bool]:
+    """Return what to segment, and the format of its files; whether they are one, or one bag."""
+    form, suffix = arguments.format, target.suffix[1:]
     if is_root(source):
-        return _list_root(arguments), False
+        if form not in (None, LABELS):
+            raise DataError(f'--format {form}: a KITTI_ROOT gives .label files')
+        # Where SemanticKITTI's tools look for predictions.
+        files = [
+            replace(scan, name=f'sequences/{name}/predictions/{scan.name}')
+            for name in list_sequences(source)
+            for scan in options.list_clouds(arguments, source / 'sequences' / name)
+        ]
+        return Inputs(source, files), LABELS, False
     scans = options.list_clouds(arguments)
-    if source.is_dir() or scans.topic:
-        return _scan_items(scans, form), False
-    suffix = target.suffix[1:]
-    if suffix in FORMATS:
-        if form not in (None, suffix):
-            raise DataError(f'{target}: ends in .{suffix}, which is not {form}')
-        return [Item(scans, [target.name])], True
-    if suffix and not target.is_dir():
-        raise DataError(f'{target}: must be a folder, or end in .{", .".join(FORMATS)}')
-    return _scan_items(scans, form), False
-
-
-def _scan_items(scans: Inputs, form: str | None, folder: str = '') -> list[Item]:
-    """List scans, which become files in a folder of the output; a bag is one item."""
-    names = [f'{folder}{scan.name}.{format_for(scan.path, form)}' for scan in scans]
     if scans.topic:
-        return [Item(scans, names)]
-    pairs = zip(scans, names, strict=True)
-    return [Item(Inputs(scan.path, [scan]), [name]) for scan, name in pairs]
-
-
-def _list_root(arguments: argparse.Namespace) -> list[Item]:
-    """List the scans of a SemanticKITTI root; labels go where its tools look for predictions."""
-    if arguments.format not in (None, LABELS):
-        raise DataError(f'--format {arguments.format}: a KITTI_ROOT gives .label files')
-    items = []
-    for sequence in list_sequences(arguments.input):
-        scans = options.list_clouds(arguments, Path(arguments.input, 'sequences', sequence))
-        items += _scan_items(scans, LABELS, f'sequences/{sequence}/predictions/')
-    return items
+        options.refuse(arguments, ('workers', 'scheduler'), 'is for scans, not for a bag')
+        return scans, form, form is None
+    if source.is_dir() or not suffix or (suffix not in FORMATS and target.is_dir()):
+        return scans, form, False
+    if suffix not in FORMATS:
+        raise DataError(f'{target}: must be a folder, or end in .{", .".join(FORMATS)}')
+    if form not in (None, suffix):
+        raise DataError(f'{target}: ends in .{suffix}, which is not {form}')
+    return Inputs(source, [replace(scan, name=target.stem) for scan in scans]), suffix, True
 
 
 def _parameters(arguments: argparse.Namespace, config: Config) -> str:
