@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import inspect
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import ConfigError, DataError, require, shown
 from gp_ground_seg.core.parameters.config import config_of
 from gp_ground_seg.core.parameters.schema import yaml_scalar
-from gp_ground_seg.data.files import staged_file
+from gp_ground_seg.data.files import check_writable, write_file
 from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame, is_root, labelled_frames
 from gp_ground_seg.lab.cluster import Runner
@@ -200,13 +199,14 @@ def print_report(
     """Measure with the runner of the options, write ``--json`` with `facts`, print the tables."""
     if arguments.markdown:
         require('tabulate', 'tabulate')
-    target = arguments.json
-    with staged_file(target, force=arguments.force) if target else nullcontext() as path:
-        with options.runner(arguments, title) as runner:
-            report = measured(runner)
-        environment = {**describe_environment(PEER), 'n_workers': runner.n_workers}
-        if path is not None:
-            report.write(path, environment, **facts)
+    if arguments.json:
+        check_writable(arguments.json, force=arguments.force)
+    with options.runner(arguments, title) as runner:
+        report = measured(runner)
+    environment = {**describe_environment(PEER), 'n_workers': runner.n_workers}
+    if arguments.json:
+        data = report.encode(environment, **facts)
+        write_file(Path(arguments.json), data, force=arguments.force)
     machine = machine_line(environment, report.backend)
     print(report.text(machine, markdown=arguments.markdown))
 
