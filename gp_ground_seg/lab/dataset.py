@@ -109,7 +109,7 @@ def find_left(
             remove_leftovers(parent)
     there = [path for path in outputs if os.path.lexists(path)]
     if force or not there:
-        return scans
+        return scans if scans.topic else scans.files
     begun = changed_at(folder / PARAMETERS)
     if parameters is None or not begun:
         raise DataError(f'{there[0]}: exists already; --force replaces it')
