@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import inspect
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -153,18 +154,14 @@ def run_evaluate(arguments: argparse.Namespace) -> int:
         if not changed:
             raise ConfigError(f'--against {arguments.against}: the same parameters as given')
     items, load = _items(arguments, cut)
-    result: list[str] = []
-
-    def measured(runner: Runner) -> Report:
+    with reporting_runner(arguments, 'evaluate') as runner:
         scores = score_methods(items, methods, load, runner=runner)
-        if changed:
-            print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
-        result.extend(_result_lines(scores))
-        return tables.evaluation(scores, config)
-
-    print_report(arguments, 'evaluate', measured, data=arguments.root, cut=cut)
+    if changed:
+        print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
+    report = tables.evaluation(scores, config)
+    print_report(arguments, report, runner, data=arguments.root, cut=cut)
     changes = [f'{name}={value}' for name, value in changed_parameters(config).items()]
-    print('', f'parameters: {", ".join(changes) or "defaults"}', *result, sep='\n')
+    print('', f'parameters: {", ".join(changes) or "defaults"}', *_result_lines(scores), sep='\n')
     return 0
 
 
@@ -186,23 +183,25 @@ def run_experiment(arguments: argparse.Namespace) -> int:
         if is_simulated
         else frames_from_options(arguments)
     )
-    print_report(arguments, name, partial(experiment.run, scans, config), experiment=name)
+    with reporting_runner(arguments, name) as runner:
+        report = experiment.run(scans, config, runner)
+    print_report(arguments, report, runner, experiment=name)
     return 0
 
 
-def print_report(
-    arguments: argparse.Namespace,
-    title: str,
-    measured: Callable[[Runner], Report],
-    **facts: Any,
-) -> None:
-    """Measure with the runner of the options, write ``--json`` with `facts`, print the tables."""
+def reporting_runner(arguments: argparse.Namespace, title: str) -> AbstractContextManager[Runner]:
+    """Return the runner of the options; refuse now what would spoil the report at its end."""
     if arguments.markdown:
         require('tabulate', 'tabulate')
     if arguments.json:
         check_writable(arguments.json, force=arguments.force)
-    with options.runner(arguments, title) as runner:
-        report = measured(runner)
+    return options.runner(arguments, title)
+
+
+def print_report(
+    arguments: argparse.Namespace, report: Report, runner: Runner, **facts: Any
+) -> None:
+    """Write ``--json`` with `facts`, and print the tables."""
     environment = {**describe_environment(PEER), 'n_workers': runner.n_workers}
     if arguments.json:
         data = report.encode(environment, **facts)

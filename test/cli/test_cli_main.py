@@ -69,6 +69,7 @@ MISTAKES = {
     'segment good -o mine': 'mine/000000.label: exists already; --force',
     'segment root --format ply': '--format ply: a KITTI_ROOT gives .label files',
     'segment root -o x.ply': 'x.ply: must be a folder',
+    'segment drive.mcap --workers 2': '--workers: is for scans, not for a bag',
     'segment drive.mcap -o x.bag': '.*only ROS 2 bags are written',
     'segment drive.mcap -o no/such/x': '.*no/such does not exist',
     'segment drive.mcap -o . --force': '.*is the input, or has it in it',
