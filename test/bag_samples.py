@@ -6,7 +6,13 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gp_ground_seg.data.bags import POINT_CLOUD2, encode_cloud, jazzy_types, new_bag
+from gp_ground_seg.data.bags import (
+    POINT_CLOUD2,
+    BagReader,
+    encode_cloud,
+    jazzy_types,
+    new_bag,
+)
 
 START = 1_317_000_000_123_456_789
 PERIOD = 100_000_000
@@ -67,6 +73,12 @@ def write_clouds(path, raws, start=0):
     with new_bag(path, {'/points': POINT_CLOUD2}) as write:
         for time, raw in enumerate(raws, start):
             write('/points', time, raw)
+
+
+def read_messages(path, *topics):
+    """Messages of a bag, or of some topics: topic, time and bytes of each."""
+    with BagReader(path) as bag:
+        return list(bag.messages(topics))
 
 
 def write_ros1_bag(path, n_clouds=3, topic='/kitti/velo/pointcloud'):

@@ -1,10 +1,9 @@
-"""Latency and losses of the node: ``python test/node_bench.py [DATA]``, on an idle machine.
+"""Latency and losses of the node: ``python test/node_bench.py [ROOT]``, on an idle machine.
 
 The node runs in a second process and is sent clouds through ROS at several rates, in a namespace
-of a random name. DATA is a folder with sequences/*/velodyne below it, a scan, a
-folder of scans, or a bag; without it, simulated scans of a sensor. What follows ``--ros-args``
-goes to the node. With --first-minute, rows are of 60 s at 10 Hz from where a node without compiled
-code begins to listen, on all cores and on one, or beside a busy loop on each of them.
+of a random name: frames of a KITTI_ROOT, or simulated scans of a sensor. What follows
+``--ros-args`` goes to the node. With --first-minute, rows are of 60 s at 10 Hz from where a node
+without compiled code begins to listen, on all cores and on one, or beside a busy loop on each.
 """
 
 import argparse
@@ -19,20 +18,21 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.cli.demo import FRAME_ID
 from gp_ground_seg.cli.options import progress
 from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_stamp
-from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.data.semantic_kitti import labelled_frames
+from gp_ground_seg.data.semantic_kitti import frames
 from gp_ground_seg.lab.scoring.report import describe_environment, machine_line
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 from gp_ground_seg.ros.node_process import INPUT, OUTPUTS, Link, NodeProcess, private_session
 
 SILENCE = 2.0
 """Time without a cloud after which what is still missing is lost [s]."""
-N_SIMULATED = 10
+N_READ, N_SIMULATED = 30, 10  # different clouds
+RATES, N_SENT = (10.0, 20.0, 50.0), 600  # [Hz], clouds at each
 PERCENTILES = {50: 'p50 [ms]', 95: 'p95', 99: 'p99', 100: 'worst'}
 
 
@@ -93,15 +93,14 @@ class Probe:
             if len(back := self._back.get(stamp, {})) == len(OUTPUTS)
         ]
         first, *_, last = self._sent.values()
-        n_sent, n_back = len(self._sent), len(latency)
-        row = {
-            'rate [Hz]': f'{asked:g}',
-            'sent [Hz]': f'{1e9 * (n_sent - 1) / (last - first):.2f}',
-        }
-        row |= {'sent': n_sent, 'back': n_back, 'lost': n_sent - n_back}
-        percents = np.percentile(latency, [*PERCENTILES]) if latency else [np.nan] * 4
-        return row | {
-            name: f'{p:.1f}' for name, p in zip(PERCENTILES.values(), percents, strict=True)
+        n_sent = len(self._sent)
+        sent_at = 1e9 * (n_sent - 1) / (last - first)
+        row = {'rate [Hz]': asked, 'sent [Hz]': sent_at, 'sent': n_sent, 'back': len(latency)}
+        percents = np.percentile(latency or [np.nan], [*PERCENTILES])
+        return {
+            **row,
+            'lost': n_sent - len(latency),
+            **dict(zip(PERCENTILES.values(), percents, strict=True)),
         }
 
 
@@ -129,7 +128,7 @@ def started(ros_args):
         node.check()
 
 
-def measure(clouds, rates, n_frames, ros_args=()):
+def measure(clouds, ros_args):
     """Results at each rate, with what the node says it dropped, and its CPU time of a cloud."""
     from diagnostic_msgs.msg import DiagnosticArray
 
@@ -142,17 +141,17 @@ def measure(clouds, rates, n_frames, ros_args=()):
             session.sleep(0.2)
             node.check()
         probe = Probe(session)
-        for rate in rates:
+        for rate in RATES:
             before, cpu = dropped_by_node(session, arrays), cpu_of(node.pid)
-            with progress(f'{rate:g} Hz')(total=n_frames) as bar:
-                found = probe.send(itertools.islice(stamped, n_frames), rate, bar.update)
-            found['CPU [ms]'] = f'{1e3 * (cpu_of(node.pid) - cpu) / n_frames:.1f}'
+            with progress(f'{rate:g} Hz')(total=N_SENT) as bar:
+                found = probe.send(itertools.islice(stamped, N_SENT), rate, bar.update)
+            found['CPU [ms]'] = 1e3 * (cpu_of(node.pid) - cpu) / N_SENT
             n_dropped = dropped_by_node(session, arrays) - before
             results.append({**found, 'reported': n_dropped})
     return results
 
 
-def first_minute(clouds, cores, is_busy, ros_args=()):
+def first_minute(clouds, cores, is_busy, ros_args):
     """Results of the first minute of a node on some `cores`, with nothing compiled before."""
     before, beside, compiled = os.sched_getaffinity(0), [], []
     with tempfile.TemporaryDirectory() as cache, contextlib.ExitStack() as stack:
@@ -172,7 +171,7 @@ def first_minute(clouds, cores, is_busy, ros_args=()):
                 if not compiled and node.is_compiled():
                     compiled.append(time.monotonic() - start)
 
-            found = probe.send(itertools.islice(restamped(clouds, 1), 600), 10.0, note)
+            found = probe.send(itertools.islice(restamped(clouds, 1), N_SENT), 10.0, note)
             cpu = cpu_of(node.pid)
             while not compiled and time.monotonic() < start + 240.0:
                 session.sleep(0.2)
@@ -182,18 +181,7 @@ def first_minute(clouds, cores, is_busy, ros_args=()):
                 process.kill()
                 process.wait()
     words = f'{len(cores)}{", busy" if is_busy else ""}'
-    seconds = f'{compiled[0]:.0f}' if compiled else '-'
-    return {'cores': words, **found, 'CPU [s]': f'{cpu:.1f}', 'numba after [s]': seconds}
-
-
-def read_scans(path, n_wanted, topic):
-    """Points of the first scans of a KITTI folder, or of what `segment` takes."""
-    if topic is None and any(path.glob('sequences/*/velodyne')):
-        frames = labelled_frames(path)[:n_wanted]
-        return [frame.points for frame in frames]
-    inputs = list_inputs(path, 4, topic)
-    clouds = [item.read().xyz for item in itertools.islice(inputs, n_wanted)]
-    return [np.column_stack([xyz, np.ones(len(xyz))]).astype(np.float32) for xyz in clouds]
+    return {'cores': words, **found, 'CPU [s]': cpu, 'numba after [s]': (*compiled, np.nan)[0]}
 
 
 def main():
@@ -202,16 +190,12 @@ def main():
     if mark in words:
         words, ros_args = words[: words.index(mark)], words[words.index(mark) + 1 :]
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('data', nargs='?')
-    parser.add_argument('--topic', help='PointCloud2 topic of a bag')
-    parser.add_argument('--clouds', type=int, default=30, help='different clouds')
-    parser.add_argument('--rates', type=float, nargs='+', default=[10.0, 20.0, 50.0])
-    parser.add_argument('--frames', type=int, default=600, help='clouds sent at each rate')
+    parser.add_argument('root', nargs='?')
     parser.add_argument('--sensor', choices=SENSORS, default='hdl-64e', help='that is simulated')
     parser.add_argument('--first-minute', action='store_true')
     given = parser.parse_args(words)
-    if given.data:
-        scans = read_scans(Path(given.data), given.clouds, given.topic)
+    if given.root:
+        scans = [frame.points for frame in frames(given.root)[:N_READ]]
     else:
         scans = [
             simulate_scan(SCENES['urban'](1), SENSORS[given.sensor], np.random.default_rng(k), k)
@@ -220,17 +204,16 @@ def main():
     clouds = [scan_cloud(points, 0, FRAME_ID) for points in scans]
     if given.first_minute:
         every = os.sched_getaffinity(0)
-        rates = [
+        rows = [
             first_minute(clouds, cores, is_busy, ros_args)
             for cores, is_busy in ((every, False), ({min(every)}, False), (every, True))
         ]
     else:
-        rates = measure(clouds, given.rates, given.frames, ros_args)
+        rows = measure(clouds, ros_args)
     n_points = sum(map(len, scans)) / len(scans)
-    source = given.data or f'simulated {given.sensor}'
+    source = given.root or f'simulated {given.sensor}'
     print(f'{source}: {len(scans)} clouds of {n_points:.0f} points')
-    for row in ([*rates[0]], *(rate.values() for rate in rates)):
-        print(' '.join(f'{cell:>10}' for cell in row))
+    print(pd.DataFrame(rows).round(1).to_string(index=False))
     print(machine_line(describe_environment(), 'numba'))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import inspect
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import ConfigError, DataError, require, shown
 from gp_ground_seg.core.parameters.config import config_of
 from gp_ground_seg.core.parameters.schema import yaml_scalar
-from gp_ground_seg.data.files import staged_file
+from gp_ground_seg.data.files import check_writable, write_file
 from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame, is_root, labelled_frames
 from gp_ground_seg.lab.cluster import Runner
@@ -154,18 +154,14 @@ def run_evaluate(arguments: argparse.Namespace) -> int:
         if not changed:
             raise ConfigError(f'--against {arguments.against}: the same parameters as given')
     items, load = _items(arguments, cut)
-    result: list[str] = []
-
-    def measured(runner: Runner) -> Report:
+    with reporting_runner(arguments, 'evaluate') as runner:
         scores = score_methods(items, methods, load, runner=runner)
-        if changed:
-            print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
-        result.extend(_result_lines(scores))
-        return tables.evaluation(scores, config)
-
-    print_report(arguments, 'evaluate', measured, data=arguments.root, cut=cut)
+    if changed:
+        print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
+    report = tables.evaluation(scores, config)
+    print_report(arguments, report, runner, data=arguments.root, cut=cut)
     changes = [f'{name}={value}' for name, value in changed_parameters(config).items()]
-    print('', f'parameters: {", ".join(changes) or "defaults"}', *result, sep='\n')
+    print('', f'parameters: {", ".join(changes) or "defaults"}', *_result_lines(scores), sep='\n')
     return 0
 
 
@@ -187,26 +183,29 @@ def run_experiment(arguments: argparse.Namespace) -> int:
         if is_simulated
         else frames_from_options(arguments)
     )
-    print_report(arguments, name, partial(experiment.run, scans, config), experiment=name)
+    with reporting_runner(arguments, name) as runner:
+        report = experiment.run(scans, config, runner)
+    print_report(arguments, report, runner, experiment=name)
     return 0
 
 
-def print_report(
-    arguments: argparse.Namespace,
-    title: str,
-    measured: Callable[[Runner], Report],
-    **facts: Any,
-) -> None:
-    """Measure with the runner of the options, write ``--json`` with `facts`, print the tables."""
+def reporting_runner(arguments: argparse.Namespace, title: str) -> AbstractContextManager[Runner]:
+    """Return the runner of the options; refuse now what would spoil the report at its end."""
     if arguments.markdown:
         require('tabulate', 'tabulate')
-    target = arguments.json
-    with staged_file(target, force=arguments.force) if target else nullcontext() as path:
-        with options.runner(arguments, title) as runner:
-            report = measured(runner)
-        environment = {**describe_environment(PEER), 'n_workers': runner.n_workers}
-        if path is not None:
-            report.write(path, environment, **facts)
+    if arguments.json:
+        check_writable(arguments.json, force=arguments.force)
+    return options.runner(arguments, title)
+
+
+def print_report(
+    arguments: argparse.Namespace, report: Report, runner: Runner, **facts: Any
+) -> None:
+    """Write ``--json`` with `facts`, and print the tables."""
+    environment = {**describe_environment(PEER), 'n_workers': runner.n_workers}
+    if arguments.json:
+        data = report.encode(environment, **facts)
+        write_file(Path(arguments.json), data, force=arguments.force)
     machine = machine_line(environment, report.backend)
     print(report.text(machine, markdown=arguments.markdown))
 

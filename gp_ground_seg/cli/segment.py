@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import statistics
-from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -16,25 +16,25 @@ from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.data.bags import BAG_SUFFIXES
-from gp_ground_seg.data.cloud_files import FORMATS, LABELS, format_for
+from gp_ground_seg.data.cloud_files import FORMATS, LABELS
 from gp_ground_seg.data.files import write_file
 from gp_ground_seg.data.inputs import Inputs, holds_bag
 from gp_ground_seg.data.semantic_kitti import is_root, list_sequences
 from gp_ground_seg.lab.dataset import (
     PARAMETERS,
-    Item,
     Outcome,
-    count_clouds,
     find_difference,
     find_left,
-    segment_block,
+    output_of,
+    segment_bag,
+    segment_scans,
 )
 
 DESCRIPTION = """\
 Split scans into ground and obstacles.
 
 INPUT is a scan (.bin .pcd .ply .npy .npz), a folder or sequence of scans, a bag
-(.bag .mcap .db3, or a rosbag2 folder), several bags, or a KITTI_ROOT. docs/datasets.md has more
+(.bag .mcap .db3, or a rosbag2 folder), or a KITTI_ROOT. docs/datasets.md has more
 on formats, and on whole data sets.
 
 A .bin gives a .label file: 40 = ground, 99 = obstacle, 0 = no return (SemanticKITTI).
@@ -59,13 +59,13 @@ EXAMPLES = """\
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
     parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
-    parser.usage = '%(prog)s INPUT [BAG ...] [-o OUT] [options]'
+    parser.usage = '%(prog)s INPUT [-o OUT] [options]'
     options.add(
         parser,
         ('input', 'scan, folder of scans, bag, or a root', {'metavar': 'INPUT'}),
-        ('more', 'further bags', {'metavar': 'BAG', 'nargs': '*', 'default': []}),
-        ('-o --output', 'for scans a folder, or a file for a single scan; for bags a folder, or '
-         'a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
+        ('more', argparse.SUPPRESS, {'nargs': '*', 'default': []}),
+        ('-o --output', 'for scans a folder, or a file for a single scan; for a bag a folder, '
+         'or a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
          {'metavar': 'OUT'}),
         ('--format', 'of a file for each scan or cloud (default: by the name of OUT, else labels '
          f'of .bin scans, and as the input): {", ".join(FORMATS)}',
@@ -81,92 +81,72 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the files of each input that are not written yet, and print a summary."""
-    config = options.read_config(arguments)
-    target = Path(arguments.output or _default_output(Path(arguments.input), arguments.format))
-    items, is_one = _list_items(arguments, target)
+    if arguments.more:
+        raise DataError(
+            f'{arguments.more[0]}: a second input, where one is taken; for several: '
+            'for f in FILES; do gp-ground-seg segment "$f"; done'
+        )
+    config, source = options.read_config(arguments), Path(arguments.input)
+    target = Path(arguments.output or _default_output(source, arguments.format))
+    scans, form, is_one = _list_scans(arguments, source, target)
     if not is_one and (target.is_file() or target.suffix[1:] in FORMATS):
         raise DataError(f'{target}: must be a folder')
     folder, place = (target.parent, target) if is_one else (target, target.resolve())
     if not place.parent.is_dir():
         raise DataError(f'{target}: the folder {place.parent} does not exist')
+    outputs = [target] if is_one else [output_of(folder, form, scan) for scan in scans]
     parameters = None if is_one else _parameters(arguments, config)
-    left = find_left(folder, items, parameters, force=arguments.force)
-    if len(left) < len(items):
-        print(f'{len(items) - len(left)} of {len(items)} were finished before')
+    left = find_left(scans, outputs, folder, parameters, force=arguments.force)
+    if len(left) < len(scans):
+        print(f'{len(scans) - len(left)} of {len(scans)} were finished before')
     if not left:
         return 0
-    used = options.spare_compiling(config, count_clouds(left))
+    used = options.spare_compiling(config, len(left))
+    write = partial(segment_scans, folder, form, used)
+    if is_one and scans.topic:
+        write = partial(segment_bag, target, used)
     with options.runner(arguments, 'segment') as runner:
         if parameters and (arguments.force or find_difference(folder, parameters)):
             write_file(folder / PARAMETERS, parameters.encode())
-        found = runner.run(partial(segment_block, folder, used), left, size_of=count_clouds)
+        found = runner.run(write, left)
     _print_summary([*chain(*found)], target, runner.n_workers)
     if not arguments.quiet:
         options.note_spared(config, used)
     return 0
 
 
-def _list_items(arguments: argparse.Namespace, target: Path) -> tuple[list[Item], bool]:
-    """List what to segment, and say whether `target` is the one file or bag that it becomes."""
-    source, form = Path(arguments.input), arguments.format
-    if arguments.more:
-        return _list_bags(arguments), False
-    if holds_bag(source) and form is None:
-        return [Item(options.list_clouds(arguments), [target.name], to_bag=True)], True
+def _list_scans(
+    arguments: argparse.Namespace, source: Path, target: Path
+) -> tuple[Inputs, str | None, bool]:
+    """Return what to segment, and the format of its files; whether they are one, or one bag."""
+    form, suffix = arguments.format, target.suffix[1:]
     if is_root(source):
-        return _list_root(arguments), False
+        if form not in (None, LABELS):
+            raise DataError(f'--format {form}: a KITTI_ROOT gives .label files')
+        # Where SemanticKITTI's tools look for predictions.
+        files = [
+            replace(scan, name=f'sequences/{name}/predictions/{scan.name}')
+            for name in list_sequences(source)
+            for scan in options.list_clouds(arguments, source / 'sequences' / name)
+        ]
+        return Inputs(source, files), LABELS, False
     scans = options.list_clouds(arguments)
-    if source.is_dir() or scans.topic:
-        return _scan_items(scans, form), False
-    suffix = target.suffix[1:]
-    if suffix in FORMATS:
-        if form not in (None, suffix):
-            raise DataError(f'{target}: ends in .{suffix}, which is not {form}')
-        return [Item(scans, [target.name])], True
-    if suffix and not target.is_dir():
-        raise DataError(f'{target}: must be a folder, or end in .{", .".join(FORMATS)}')
-    return _scan_items(scans, form), False
-
-
-def _scan_items(scans: Inputs, form: str | None, folder: str = '') -> list[Item]:
-    """List scans, which become files in a folder of the output; a bag is one item."""
-    names = [f'{folder}{scan.name}.{format_for(scan.path, form)}' for scan in scans]
     if scans.topic:
-        return [Item(scans, names)]
-    pairs = zip(scans, names, strict=True)
-    return [Item(Inputs(scan.path, [scan]), [name]) for scan, name in pairs]
-
-
-def _list_root(arguments: argparse.Namespace) -> list[Item]:
-    """List the scans of a SemanticKITTI root; labels go where its tools look for predictions."""
-    if arguments.format not in (None, LABELS):
-        raise DataError(f'--format {arguments.format}: a KITTI_ROOT gives .label files')
-    items = []
-    for sequence in list_sequences(arguments.input):
-        scans = options.list_clouds(arguments, Path(arguments.input, 'sequences', sequence))
-        items += _scan_items(scans, LABELS, f'sequences/{sequence}/predictions/')
-    return items
-
-
-def _list_bags(arguments: argparse.Namespace) -> list[Item]:
-    """List several bags, each of which becomes one in the output folder."""
-    options.refuse(arguments, ['format'], 'is for scans, or for one bag')
-    paths = [Path(source) for source in (arguments.input, *arguments.more)]
-    for path in paths:
-        if not holds_bag(path):
-            raise DataError(f'{path}: is no bag, of several inputs each must be one')
-    names = [_default_output(path).name for path in paths]
-    ((name, n_bags),) = Counter(names).most_common(1)
-    if n_bags > 1:
-        raise DataError(f'two of the bags would become {name}')
-    items = zip(paths, names, strict=True)
-    return [Item(options.list_clouds(arguments, p), [name], to_bag=True) for p, name in items]
+        options.refuse(arguments, ('workers', 'scheduler'), 'is for scans, not for a bag')
+        return scans, form, form is None
+    if source.is_dir() or not suffix or (suffix not in FORMATS and target.is_dir()):
+        return scans, form, False
+    if suffix not in FORMATS:
+        raise DataError(f'{target}: must be a folder, or end in .{", .".join(FORMATS)}')
+    if form not in (None, suffix):
+        raise DataError(f'{target}: ends in .{suffix}, which is not {form}')
+    return Inputs(source, [replace(scan, name=target.stem) for scan in scans]), suffix, True
 
 
 def _parameters(arguments: argparse.Namespace, config: Config) -> str:
     """Return what the files of an output folder depend on, beside the content of the inputs."""
     source = Path(arguments.input).resolve()
-    if arguments.more or not (source.is_dir() or holds_bag(source)):
+    if not (source.is_dir() or holds_bag(source)):
         source = source.parent  # the same names from elsewhere are other inputs
     title = f'written by gp-ground-seg segment {__version__}, from {source}'
     for name in 'topic', 'columns':

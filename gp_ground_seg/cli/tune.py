@@ -9,7 +9,7 @@ from pathlib import Path
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.data.files import check_writable, staged_file, write_file
+from gp_ground_seg.data.files import check_writable, write_file
 from gp_ground_seg.lab.tuner import Tuner, open_server, tunable
 
 DESCRIPTION = """\
@@ -61,8 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     def write(values: Config) -> str:
         nonlocal is_ours
-        with staged_file(output, force=is_ours) as part:
-            write_file(part, values.to_yaml('Found with gp-ground-seg tune.').encode())
+        text = values.to_yaml('Found with gp-ground-seg tune.')
+        write_file(output, text.encode(), force=is_ours)
         is_ours = True
         return f'written to {output}; a running node takes it by {load}'
 

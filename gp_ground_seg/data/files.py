@@ -122,14 +122,14 @@ def remove_leftovers(folder: Path, name: str = '') -> None:
             shutil.rmtree(left)
 
 
-def write_file(path: Path, data: bytes) -> None:
-    """Write a file, and the folders that it is in, as `staged_file` does; it replaces another.
+def write_file(path: Path, data: bytes, *, force: bool = True) -> None:
+    """Write a file, and the folders that it is in, as `staged_file` does.
 
     What killed runs left of it stays: a folder of many files is searched once, by its writer.
     """
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    with staged_file(path, force=True, tidies=False) as part, writing(path):
+    with staged_file(path, force=force, tidies=False) as part, writing(path):
         part.write_bytes(data)
 
 
@@ -174,10 +174,6 @@ def staged_file(
         if not str(error.filename).startswith(str(hidden)):
             raise  # of something else in the block
         raise DataError(f'{target}: cannot be written: {reason_of(error)}') from error
-    except DataError as error:
-        if str(hidden) not in str(error):
-            raise
-        raise DataError(str(error).replace(str(product), str(target))) from error
 
 
 def _check(target: str | Path, force: bool, is_kind: Callable[[Path], bool], path: Path) -> None:

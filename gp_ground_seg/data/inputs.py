@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from gp_ground_seg.core.errors import LOGGER, DataError, shown
 from gp_ground_seg.core.pipeline.points import take_points
@@ -34,9 +35,13 @@ class Input:
     # returns the `Cloud`; raises DataError if it cannot be read, or can be no scan
     read: Callable[[], Cloud]
 
+    def __str__(self) -> str:
+        """Path."""
+        return str(self.path)
+
 
 @dataclass(frozen=True)
-class Inputs:
+class Inputs(Sequence[Input]):
     """Clouds in their order: ``len()``, iteration and indices; read one at a time.
 
     A bag is read from its beginning each time; its clouds are best iterated over.
@@ -68,11 +73,9 @@ class Inputs:
                 place = f'message {k} of topic {self.topic}, recorded at {time} ns'
                 yield f'{self.path}: {place}', time, raw
 
-    def __getitem__(self, index: int) -> Input:
-        """Return one cloud, not read yet; IndexError beyond the last."""
-        if not 0 <= index < len(self):
-            raise IndexError(f'{self.path}: {index} of {len(self)} clouds')
-        return next(islice(iter(self), index, None))
+    def __getitem__(self, index: Any) -> Any:
+        """Return one cloud, not read yet."""
+        return next(islice(self, index, None))
 
 
 def list_inputs(

@@ -59,28 +59,27 @@ class Runner:
         function: Function,
         items: Sequence[Any],
         group: Callable[[Any], Hashable] | None = None,
-        size_of: Callable[[Sequence[Any]], int] = len,
     ) -> list[Any]:
         """Return what `function` makes of each block of the items, in their order.
 
-        In this process they are one block; else `group` is as in `cut`. The bar counts `size_of`
-        of each block. A block whose worker dies is computed again. Raises what `function` raises,
-        and DataError if every worker that computes a block dies, or the scheduler is lost.
+        In this process they are one block; else `group` is as in `cut`. A block whose worker dies
+        is computed again. Raises what `function` raises, and DataError if every worker that
+        computes a block dies, or the scheduler is lost.
         """
         if self.client is None:
-            return [function(items, partial(self.bar, total=size_of(items)))]
+            return [function(items, partial(self.bar, total=len(items)))]
         from distributed import as_completed
 
         blocks = cut(items, group, self.n_workers)
         compute = partial(_compute_block, __version__, function)
         futures = self.client.map(compute, blocks, pure=False)
         block_of, found = dict(zip(futures, blocks, strict=True)), {}
-        with self.bar(total=size_of(items)) as bar:
+        with self.bar(total=len(items)) as bar:
             for future in as_completed(futures, loop=self.client.loop):
                 found[future], notes = _result_of(future, block_of[future])
                 for note in notes:
                     log_once(*note)
-                bar.update(size_of(block_of[future]))
+                bar.update(len(block_of[future]))
         return [found[future] for future in futures]
 
 

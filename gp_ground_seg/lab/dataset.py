@@ -1,10 +1,10 @@
-"""Scans and bags that are segmented into files, and what of it has been done before."""
+"""Scans that are segmented into files, or a bag into a bag, and what has been done before."""
 
 from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,9 +15,9 @@ from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.bags import POINT_CLOUD2, decode_cloud, encode_cloud, new_bag, storage_of
-from gp_ground_seg.data.cloud_files import encode_output
+from gp_ground_seg.data.cloud_files import encode_output, format_for
 from gp_ground_seg.data.files import changed_at, naming, read_bytes, remove_leftovers, write_file
-from gp_ground_seg.data.inputs import Inputs
+from gp_ground_seg.data.inputs import Input, Inputs
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
 from gp_ground_seg.lab.cluster import Progress
 
@@ -25,47 +25,6 @@ PARAMETERS = 'parameters.yaml'
 """File of an output folder that says how its files were made."""
 TOPICS = {'/ground': Label.GROUND, '/obstacles': Label.OBSTACLE}
 """Of a bag that is written."""
-
-
-class Item(NamedTuple):
-    """Scans, or the clouds of a bag, to segment into a file each, or into one bag."""
-
-    inputs: Inputs
-    names: Sequence[str]  # of the files or the bag to write, below the output folder
-    to_bag: bool = False
-
-    def __str__(self) -> str:
-        return str(self.inputs.path)
-
-    def write(self, segmenter: GroundSegmenter, folder: Path) -> Iterator[Segmentation]:
-        """Write into a folder, replacing others, and yield the result for each cloud."""
-        if self.to_bag:
-            yield from write_bag(self.inputs, folder / self.names[0], segmenter)
-            return
-        for scan, name in zip(self.inputs, self.names, strict=True):
-            cloud, path = scan.read(), folder / name
-            with naming(scan.path):
-                result = segmenter.segment(cloud.xyz)
-            write_file(path, encode_output(path, cloud, result))
-            yield result
-
-
-def write_bag(source: Inputs, target: Path, segmenter: GroundSegmenter) -> Iterator[Segmentation]:
-    """Write a bag of the clouds of a bag, and yield the result for each.
-
-    It is stored as its suffix says, else as the input, and appears when the iteration ends.
-    Raises DataError if a cloud cannot be read, or the bag cannot be written.
-    """
-    storage = storage_of(source.path).replace('ros1', 'mcap')  # no ROS 1 bag is written
-    topics = dict.fromkeys(TOPICS, POINT_CLOUD2)
-    with new_bag(target, topics, force=True, storage=storage) as write:
-        for place, time, raw in source.messages():
-            with naming(place):
-                cloud = decode_cloud(raw)
-                result = segmenter.segment(read_xyz(cloud))
-            for part, label in TOPICS.items():
-                write(part, time, encode_cloud(select_points(cloud, result.label == label)))
-            yield result
 
 
 class Outcome(NamedTuple):
@@ -85,37 +44,63 @@ class Outcome(NamedTuple):
         return cls(len(label), n_ground, seconds, pose.measured, pose.contradictions)
 
 
-def segment_block(
-    folder: Path, config: Config, items: Sequence[Item], progress: Progress
+def output_of(folder: Path, form: str | None, scan: Input) -> Path:
+    """File of a folder that a scan becomes, of a format or by default of its own."""
+    return folder / f'{scan.name}.{format_for(scan.path, form)}'
+
+
+def segment_scans(
+    folder: Path, form: str | None, config: Config, scans: Iterable[Input], progress: Progress
 ) -> list[Outcome]:
-    """Segment items into the files of a folder."""
-    segmenter = GroundSegmenter(config)
-    results = (result for item in items for result in item.write(segmenter, folder))
-    return [Outcome.of(result) for result in progress(results)]
+    """Write the file of each scan into a folder, replacing others."""
+    segmenter, found = GroundSegmenter(config), []
+    for scan in progress(scans):
+        cloud, path = scan.read(), output_of(folder, form, scan)
+        with naming(scan.path):
+            result = segmenter.segment(cloud.xyz)
+        write_file(path, encode_output(path, cloud, result))
+        found.append(Outcome.of(result))
+    return found
 
 
-def count_clouds(items: Iterable[Item]) -> int:
-    """Count the clouds of items."""
-    return sum(len(item.inputs) for item in items)
+def segment_bag(target: Path, config: Config, bag: Inputs, progress: Progress) -> list[Outcome]:
+    """Write a bag of the ground and the obstacles of each cloud of a bag, replacing another.
+
+    It is stored as its suffix says, else as the input. Raises DataError if a cloud cannot be read,
+    or the bag cannot be written.
+    """
+    storage = storage_of(bag.path).replace('ros1', 'mcap')  # no ROS 1 bag is written
+    topics = dict.fromkeys(TOPICS, POINT_CLOUD2)
+    segmenter, found = GroundSegmenter(config), []
+    with new_bag(target, topics, force=True, storage=storage) as write:
+        for place, time, raw in progress(bag.messages()):
+            with naming(place):
+                cloud = decode_cloud(raw)
+                result = segmenter.segment(read_xyz(cloud))
+            for part, label in TOPICS.items():
+                write(part, time, encode_cloud(select_points(cloud, result.label == label)))
+            found.append(Outcome.of(result))
+    return found
 
 
 def find_left(
-    folder: Path, items: Sequence[Item], parameters: str | None, *, force: bool
-) -> Sequence[Item]:
-    """Return the items to segment: all with `force`, else those that are not finished.
+    scans: Inputs, outputs: Sequence[Path], folder: Path, parameters: str | None, *, force: bool
+) -> Sequence[Input]:
+    """Return the scans to segment: all with `force`, else those that are not finished.
 
-    Output is finished that is newer than its input, and no older than `PARAMETERS`. Raises
-    DataError if an output is an input, and without `force` if it was made with other parameters,
-    or by no run with parameters.
+    Output is finished that is newer than its input, and no older than `PARAMETERS`; of a bag all
+    clouds are done again if one is not. Raises DataError if an output is an input, and without
+    `force` if it was made with other parameters, or by no run with parameters.
 
     Parameters
     ----------
+    outputs : sequence of Path
+        The file that each scan becomes, or the one that all of them do.
     parameters : str or None
-        What a run into a folder writes into `PARAMETERS`; None if the output is a single one.
+        What a run into a `folder` writes into `PARAMETERS`; None if the output is a single one.
     """
-    paths = [item.inputs.path.resolve() for item in items]
-    inputs = {place for path in paths for place in (path, *path.parents)}
-    outputs = [folder / name for item in items for name in item.names]
+    sources = [scan.path for scan in scans.files] or [scans.path] * len(outputs)
+    inputs = {place for path in map(Path.resolve, {*sources}) for place in (path, *path.parents)}
     for path in outputs:
         if path.resolve() in inputs:
             raise DataError(f'{path}: is the input, or has it in it; name another output')
@@ -124,13 +109,17 @@ def find_left(
             remove_leftovers(parent)
     there = [path for path in outputs if os.path.lexists(path)]
     if force or not there:
-        return items
+        return scans if scans.topic else scans.files
     begun = changed_at(folder / PARAMETERS)
     if parameters is None or not begun:
         raise DataError(f'{there[0]}: exists already; --force replaces it')
     if said := find_difference(folder, parameters):
         raise DataError(f'{said}; give another output folder, or --force to start anew')
-    return [item for item in items if not _is_finished(folder, item, begun)]
+    is_left = [
+        changed_at(path) <= changed_at(source) or changed_at(path) < begun
+        for source, path in zip(sources, outputs, strict=True)
+    ]
+    return scans if scans.topic and any(is_left) else [*itertools.compress(scans.files, is_left)]
 
 
 def find_difference(folder: Path, parameters: str) -> str:
@@ -143,9 +132,3 @@ def find_difference(folder: Path, parameters: str) -> str:
         if said != now:
             return f'{path}: says "{said}", now it is "{now}"'
     return ''
-
-
-def _is_finished(folder: Path, item: Item, begun: int) -> bool:
-    changed = changed_at(item.inputs.path)
-    written = [changed_at(folder / name) for name in item.names]
-    return all(time > changed and time >= begun for time in written)

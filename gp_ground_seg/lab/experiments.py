@@ -101,8 +101,7 @@ def load_scan(item: Frame | SimulatedFrame) -> KnownScan:
     class_of[low] = len(CLASSES) - len(LOW_CLASSES) + nearest
     return KnownScan(
         item.sequence, f'{item.seed}/{item.x:g}', made.points, truth,
-        ground_z=made.ground_z, is_ground=made.is_ground,
-        objects=Objects(class_of, made.object_id, made.ground_z),
+        ground_z=made.ground_z, objects=Objects(class_of, made.object_id, made.ground_z),
         std='ground_std', cluster=f'{item.scene} {item.seed}',
         mount=(sensor.height, sensor.origin or (0.0, 0.0, 0.0)),
     )  # fmt: skip

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.core.frame import OUTSIDE, FloatArray
+from gp_ground_seg.core.frame import OUTSIDE, FloatArray, Label
 from gp_ground_seg.core.parameters.config import Config, find_preset
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.lab.cluster import HERE, Runner
@@ -100,7 +100,7 @@ def _rows(
     # In double precision, which those of the labels are not in.
     x, y, z = common.pose.level(scan.points[:, :3]).T.astype(np.float64)
     # A candidate is the point at the same place.
-    modelled = scan.is_ground & (grid.bin != OUTSIDE)
+    modelled = (scan.truth == Label.GROUND) & (grid.bin != OUTSIDE)
     modelled &= ~np.isin(x + 1j * y, candidates.x + 1j * candidates.y)
     rows = []
     for segment in segments:

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import ros_helpers as ros
-from bag_samples import PERIOD, START, write_ros1_bag, write_ros2_bag
+from bag_samples import PERIOD, START, read_messages, write_ros1_bag, write_ros2_bag
 from cli_runner import PATIENCE, error_line, run, until_ctrl_c, wait_for
 from rclpy.node import Node
 from ros_helpers import Collector, isolated_context, spinning
@@ -20,7 +20,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.cli import bags
-from gp_ground_seg.data.bags import BagReader, decode_cloud, stamp_of
+from gp_ground_seg.data.bags import decode_cloud, stamp_of
 from gp_ground_seg.ros import session
 
 
@@ -64,8 +64,7 @@ play = functools.partial(run, 'play')
 
 
 def recorded(bag, topic):
-    with BagReader(bag) as reader:
-        return [raw for _, _, raw in reader.messages([topic])]
+    return [raw for _, _, raw in read_messages(bag, topic)]
 
 
 def test_every_byte_of_every_topic_at_the_recorded_times(tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_samples import read_messages
 from cli_runner import PATIENCE, children, is_running, start, until_ctrl_c, wait_for
 from conftest import REPOSITORY
 
@@ -18,7 +19,7 @@ from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.cli.demo import Tally
 from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.data.bags import BagReader, decode_cloud
+from gp_ground_seg.data.bags import decode_cloud
 from gp_ground_seg.data.point_cloud2 import select_points
 from gp_ground_seg.ros import loader, session
 from gp_ground_seg.ros.node_process import NodeProcess, private_session
@@ -76,8 +77,8 @@ def test_demo_without_data(rclpy, tmp_path):
     assert (folder / 'scan.png').read_bytes().startswith(b'\x89PNG')
     # Fast DDS only warns about a profile that it cannot read, and goes on without.
     assert 'XML' not in (folder / 'node.log').read_text()
-    with BagReader(folder / 'drive.mcap') as bag:
-        n_points = sum(decode_cloud(raw).width for _, _, raw in bag.messages([demo.TOPIC]))
+    messages = read_messages(folder / 'drive.mcap', demo.TOPIC)
+    n_points = sum(decode_cloud(raw).width for _, _, raw in messages)
     count = f'{n_points:,}'.replace(',', ' ')
     assert f'{count} in 4 scans sent, {count} back' in first.stdout
     assert again.returncode == 2 and len(again.stderr.splitlines()) == 1

@@ -6,6 +6,7 @@ import pytest
 from cli_runner import run
 from evaluation_samples import write_streets
 
+from gp_ground_seg import Config
 from gp_ground_seg.cli.evaluate import EXPERIMENTS
 from gp_ground_seg.lab import table1
 
@@ -42,6 +43,7 @@ def test_tables_and_the_rows_below_them(case, root, tmp_path, capsys, monkeypatc
     document = json.loads((tmp_path / 'a.json').read_text())
     assert document['experiment'] == words[0]
     assert document['config_changes'] == {'grid.n_bins': 40}
+    assert document['config'] == Config().replace(**{'grid.n_bins': 40}).nested()
     tables = {key: found for key, found in document.items() if isinstance(found, list)}
     lengths, n_rows = CASES[case]
     rows = tables.pop('rows')

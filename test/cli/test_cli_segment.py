@@ -11,6 +11,7 @@ from pathlib import Path
 import bag_samples as samples
 import numpy as np
 import pytest
+from bag_samples import read_messages
 from cli_runner import error_line, run, start, wait_for
 
 from gp_ground_seg import Config, GroundSegmenter, Label
@@ -18,7 +19,7 @@ from gp_ground_seg.cli.segment import _pose_summary
 from gp_ground_seg.core.errors import in_thousands
 from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
-from gp_ground_seg.data.bags import BagReader, decode_cloud, encode_cloud, storage_of
+from gp_ground_seg.data.bags import decode_cloud, encode_cloud, storage_of
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 
@@ -55,11 +56,6 @@ def write_scans(folder, n_scans=3):
     for k in range(n_scans):
         samples.scan(k).tofile(folder / f'{k:06d}.bin')
     return folder
-
-
-def read_messages(path):
-    with BagReader(path) as bag:
-        return list(bag.messages())
 
 
 def hidden(folder):

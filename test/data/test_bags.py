@@ -21,11 +21,6 @@ from gp_ground_seg.data.inputs import holds_bag
 NAMES = 'drive', 'drive.mcap', 'drive.db3'
 
 
-def read_all(path):
-    with BagReader(path) as bag:
-        return list(bag.messages())
-
-
 def new_bag_at(path):
     new_bag(path, {}).__enter__()
 
@@ -90,11 +85,11 @@ def test_the_topic_is_chosen_and_what_a_folder_lacks_is_noticed(tmp_path):
             bag.pick_point_cloud_topic('/note')
     (path / 'metadata.yaml').unlink()
     with pytest.raises(DataError, match=r'no metadata\.yaml in it\).*one by one: two\.mcap$'):
-        read_all(path)
+        samples.read_messages(path)
     samples.write_ros2_bag(tmp_path / 'a.db3')
     (tmp_path / 'a.db3-wal').write_bytes(b'left by a crash')
     with pytest.raises(DataError, match=r'was not closed, some of it is in a\.db3-wal'):
-        read_all(tmp_path / 'a.db3')
+        samples.read_messages(tmp_path / 'a.db3')
 
 
 def test_errors_of_the_caller_pass_unchanged(tmp_path):

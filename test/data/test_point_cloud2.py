@@ -16,7 +16,6 @@ from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.bags import (
     cloud_from_columns,
-    decode_cloud,
     encode_cloud,
     stamp_of,
     with_stamp,
@@ -217,14 +216,3 @@ def test_selection_and_another_stamp_keep_all_else():
         (dataclasses.replace(moved, header=cloud.header), cloud),
     ):
         assert encode_cloud(found) == encode_cloud(expected)
-
-
-def test_cloud_from_columns_is_packed_and_typed():
-    points = samples.scan(1)
-    columns = {**dict(zip('xyz', points.T, strict=False)), 'label': np.arange(1801, dtype='u4')}
-    cloud = decode_cloud(encode_cloud(cloud_from_columns((5, 6), 'lidar', columns)))
-    assert (stamp_of(cloud), cloud.header.frame_id, cloud.point_step) == ((5, 6), 'lidar', 16)
-    found = read_fields(cloud)
-    assert found.dtype == [*((name, 'f4') for name in 'xyz'), ('label', 'u4')]
-    for name, values in columns.items():
-        np.testing.assert_array_equal(found[name], values)

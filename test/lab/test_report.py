@@ -1,15 +1,13 @@
 """Tables in their three forms; what is recorded of machine, source and parameters."""
 
-import json
 import math
 import subprocess
 
-import numpy as np
 import pandas as pd
 
-from gp_ground_seg import Config, __version__
+from gp_ground_seg import __version__
 from gp_ground_seg.lab.scoring import report
-from gp_ground_seg.lab.scoring.report import Form, Report, Table
+from gp_ground_seg.lab.scoring.report import Form, Table
 
 TABLE = Table(
     'Scores',
@@ -47,20 +45,6 @@ def test_forms_of_a_table():
         {'name': '08', 'points': None, 'iou': None, 'peer_iou': 2e-20, 'change': None},
         {'name': 'all', 'points': 1234572, 'iou': 0.5, 'peer_iou': None, 'change': 0.25},
     ]
-
-
-def test_json_files_have_null_for_what_is_undefined(tmp_path):
-    rows = pd.DataFrame({'n': np.array([3]), 'x': [math.nan], 'is_so': [np.bool_(True)]})
-    config = Config().replace(**{'label.ground_tolerance': 0.123})
-    found = Report({'table': TABLE}, report.records(rows), 'numba', config)
-    found.write(tmp_path / 'a.json', {'cpu': 'x'}, cut=0.5)
-    document = json.loads((tmp_path / 'a.json').read_text())
-    assert document == {
-        'cut': 0.5, 'backend': 'numba', 'environment': {'cpu': 'x'},
-        'table': report.records(TABLE.frame), 'rows': [{'n': 3, 'x': None, 'is_so': True}],
-        'config_changes': {'label.ground_tolerance': 0.123}, 'config': config.nested(),
-    }  # fmt: skip
-    assert isinstance(document['rows'][0]['n'], int)
 
 
 def test_the_environment_is_recorded():

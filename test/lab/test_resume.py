@@ -4,7 +4,6 @@ import os
 import shutil
 
 import pytest
-from bag_samples import write_ros2_bag
 from cli_runner import error_line, run
 from evaluation_samples import label_files, write_two_drives
 
@@ -25,22 +24,6 @@ def segmented(tmp_path_factory):
 
 def times(folder):
     return {path: path.stat().st_mtime_ns for path in folder.rglob('*')}
-
-
-def test_several_bags_become_one_each(tmp_path, capsys):
-    bags, out = [tmp_path / 'a.mcap', tmp_path / 'b.mcap'], tmp_path / 'out'
-    for k, bag in enumerate(bags):
-        write_ros2_bag(bag, n_clouds=2 + k)
-        assert run('segment', bag, '--quiet') == 0
-    words = ['segment', *bags, '-o', out]
-    assert run(*words) == 0
-    for name in ('a_ground.mcap', 'b_ground.mcap'):
-        assert (out / name).read_bytes() == (tmp_path / name).read_bytes()
-    assert '5 frames' in capsys.readouterr().out
-    bags[1].unlink()
-    write_ros2_bag(bags[1], n_clouds=4)
-    assert run(*words) == 0
-    assert capsys.readouterr().out.startswith('1 of 2 were finished before\n4 frames, ')
 
 
 @pytest.mark.parametrize(

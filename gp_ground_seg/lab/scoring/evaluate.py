@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.backend import Backend
 from gp_ground_seg.core.errors import PointCloudError, shown
-from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
+from gp_ground_seg.core.frame import FloatArray, Label
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
@@ -113,8 +113,8 @@ class KnownScan:
     points: npt.NDArray[Any]  # (N, >=3) x, y, z [m], and intensity
     truth: Labels | None = None  # (N,) true `Label`, if known; UNKNOWN does not count
     semantic: npt.NDArray[np.integer] | None = None  # (N,) classes, if known
-    ground_z: npt.NDArray[np.floating] | None = None  # (N,) true height of the ground [m]
-    is_ground: BoolArray | None = None  # (N,) points under which the surface is compared with it
+    # (N,) true height of the ground [m], with which the surface under true ground is compared
+    ground_z: npt.NDArray[np.floating] | None = None
     objects: Objects | None = None  # what stands on the ground, if known
     std: str = 'return_std'
     """Field of `Segmentation` that the errors of the height are compared with: heights of ground
@@ -144,7 +144,7 @@ def labelled_scan(
     found = objects.labelled_objects(points, entries, is_ground)
     can_be_cut = (found.class_of >= 0) & (semantic != VEGETATION)
     low = objects.cut_objects(points, can_be_cut, is_ground, cut) if cut else None
-    return KnownScan(sequence, index, points, truth, semantic, z, is_ground, found, cut=low)
+    return KnownScan(sequence, index, points, truth, semantic, z, found, cut=low)
 
 
 def score_methods(
@@ -236,8 +236,8 @@ def score_scan(scan: KnownScan, result: MethodResult | Segmentation) -> Rows:
     if scan.truth is not None:
         sums |= metrics.count_labels(label, scan.truth)
         rows['rings'] = metrics.count_rings(label, scan.truth, scan.points)
-    if scan.ground_z is not None and scan.is_ground is not None:
-        ground, std = scan.is_ground, getattr(result, scan.std, None)
+    if scan.ground_z is not None:
+        ground, std = scan.truth == Label.GROUND, getattr(result, scan.std, None)
         sums |= metrics.height_sums(
             scan.ground_z[ground], result.ground_z[ground], None if std is None else std[ground]
         )

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gp_ground_seg
 from gp_ground_seg.core.errors import require
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.data.files import write_file
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -139,8 +138,8 @@ class Report(NamedTuple):
         tables = [table.text(markdown=markdown) for table in self.tables.values()]
         return '\n\n'.join([*tables, machine])
 
-    def write(self, path: Path, environment: Mapping[str, Any], **facts: Any) -> None:
-        """Write every number as JSON, and further `facts`."""
+    def encode(self, environment: Mapping[str, Any], **facts: Any) -> bytes:
+        """Return every number as JSON, and further `facts`."""
         document = {
             'config_changes': changed_parameters(self.config),
             'config': self.config.nested(),
@@ -150,7 +149,7 @@ class Report(NamedTuple):
             **{name: records(table.frame) for name, table in self.tables.items()},
             'rows': self.rows,
         }
-        write_file(path, (json.dumps(document, indent=2, allow_nan=False) + '\n').encode())
+        return (json.dumps(document, indent=2, allow_nan=False) + '\n').encode()
 
 
 def changed_parameters(config: Config) -> dict[str, Any]:

@@ -75,19 +75,11 @@ class Solid(ABC):
 
     def entry(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
         """Range [m] at which each ray (R, 3) enters the solid, infinite if it does not, (R,)."""
-        result = np.full(len(direction), np.inf)
         offset = origin - np.array([self.x, self.y, 0.0])
-        dx, dy = direction[:, 0], direction[:, 1]
-        aside = np.abs(offset[:, 0] * dy - offset[:, 1] * dx)
-        ahead = offset[:, 0] * dx + offset[:, 1] * dy < self.radius
-        near = np.flatnonzero(ahead & (aside <= self.radius * np.hypot(dx, dy)))
-        offset, direction = offset[near], direction[near]
-
         between = slab(self.bottom, self.top, offset[:, 2], direction[:, 2])
         intervals = np.array([between, *self._outline(offset, direction)])
         enter, leave = intervals[:, 0].max(axis=0), intervals[:, 1].min(axis=0)
-        result[near] = np.where((enter <= leave) & (enter > 0.0), enter, np.inf)
-        return result
+        return np.where((enter <= leave) & (enter > 0.0), enter, np.inf)
 
 
 @dataclass(frozen=True)
@@ -142,15 +134,8 @@ def nearest_solid(
     azimuth = np.arctan2(direction[:, 1], direction[:, 0])
     order = np.argsort(azimuth)
     azimuth = azimuth[order]
-    x, y = starts[0, :2] if origin.ndim == 1 else np.full(2, np.nan)
-    gaps = [math.hypot(solid.x - x, solid.y - y) - solid.radius for solid in solids]
-    for k in np.argsort(gaps, kind='stable').tolist():
-        solid, rays = solids[k], order
-        if origin.ndim == 1:
-            rays = order[_find_towards(solid, origin, azimuth)]
-            rays = rays[distance[rays] > gaps[k]]  # the others end before it
-        if not len(rays):
-            continue
+    for k, solid in enumerate(solids):
+        rays = order[_find_towards(solid, origin, azimuth)] if origin.ndim == 1 else order
         entry = solid.entry(starts[rays], direction[rays])
         nearer = entry < distance[rays]
         distance[rays[nearer]], index[rays[nearer]] = entry[nearer], k

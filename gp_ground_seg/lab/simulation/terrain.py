@@ -13,7 +13,7 @@ import itertools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -48,10 +48,6 @@ class Terrain(ABC):
     @abstractmethod
     def breaks(self) -> FloatArray:
         """Break lines as rows a, b, c of ``a x + b y = c``, (B, 3)."""
-
-    def ceiling(self) -> Terrain:
-        """Terrain without waves that is nowhere below this one; itself if it has none."""
-        return self
 
     def height(self, x: FloatArray | float, y: FloatArray | float) -> FloatArray:
         """Exact height [m] at x, y [m]; scalars or arrays of one shape."""
@@ -111,10 +107,8 @@ class Waves(Terrain):
     def along(self, at: FloatArray, direction: FloatArray, piece: OptionalArray = None) -> Along:
         """See `Terrain.along`."""
         factor, factor_slope, _ = self.envelope.along(at, direction, piece)
-        # A smooth road, most of what a sensor sees, has no waves to add up.
-        rough = np.flatnonzero((factor != 0.0) | (factor_slope != 0.0))
-        (x, y), (dx, dy) = at[rough].T, direction[rough].T
-        sums = np.zeros((4, len(rough)))
+        (x, y), (dx, dy) = at.T, direction.T
+        sums = np.zeros((4, len(at)))
         waves = zip(self.wave_vectors, self.amplitudes, self.phases, strict=True)
         for (kx, ky), amplitude, phase in waves:
             angle = kx * x + ky * y + phase
@@ -126,8 +120,7 @@ class Waves(Terrain):
                 np.abs(amplitude) * rate**2,
             )
         # Height, slope, and bounds of the sizes of slope and bend, where the envelope is one.
-        height, slope, slope_bound, bend_bound = full = np.zeros((4, len(at)))
-        full[:, rough] = sums
+        height, slope, slope_bound, bend_bound = sums
         index = self.envelope.piece_index(at if piece is None else piece)
         return Along(
             factor * height,
@@ -147,11 +140,6 @@ class Waves(Terrain):
         """Edges of the envelope, (B, 3)."""
         return self.envelope.breaks()
 
-    def ceiling(self) -> Terrain:
-        """Envelope times the sum of all amplitudes."""
-        total = float(np.abs(self.amplitudes).sum())
-        return replace(self.envelope, coefficients=self.envelope.coefficients * total)
-
 
 @dataclass(frozen=True, eq=False)
 class Sum(Terrain):
@@ -167,11 +155,6 @@ class Sum(Terrain):
     def breaks(self) -> FloatArray:
         """Break lines of all parts, (B, 3)."""
         return np.concatenate([part.breaks() for part in self.parts])
-
-    def ceiling(self) -> Terrain:
-        """Sum of the ceilings."""
-        ceilings = tuple(part.ceiling() for part in self.parts)
-        return self if ceilings == self.parts else Sum(ceilings)
 
 
 def rough(
@@ -265,14 +248,9 @@ def first_hit(
     terrain: Terrain, origin: FloatArray, direction: FloatArray, max_range: float
 ) -> FloatArray:
     """Range [m] at which each ray (R, 3) first meets the terrain, infinite beyond `max_range`."""
-    start, ceiling = np.zeros(len(origin)), terrain.ceiling()
-    if ceiling is not terrain:
-        # Free space above all waves is crossed in a few steps.
-        start = first_hit(ceiling, origin, direction, max_range)
-    hit = np.full(len(origin), np.inf)
-    ray = np.flatnonzero(start <= max_range)
-    ends = _piece_ends(terrain, origin[ray], direction[ray], max_range)
-    t, piece = start[ray].copy(), np.sum(ends < start[ray, None], axis=1)
+    hit, ray = np.full(len(origin), np.inf), np.arange(len(origin))
+    ends = _piece_ends(terrain, origin, direction, max_range)
+    t, piece = np.zeros(len(ray)), np.zeros(len(ray), np.intp)
     while len(ray):
         rows = np.arange(len(ray))
         end = ends[rows, piece]
