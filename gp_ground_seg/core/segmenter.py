@@ -170,7 +170,7 @@ class GroundSegmenter:
         timer.mark('faces')
         # 4. Relief of the terrain; lines along each segment, over it, without lowest points of
         #    faces with occluded base; pseudo-inputs. The prior mean is the ground near the sensor.
-        relief, candidates, faces = backend.find_relief(scan.candidates, faces, height, config)
+        relief, candidates, shown = backend.find_relief(scan.candidates, faces, height, config)
         candidates, lines, pseudo, onward, in_face = backend.extract_lines(
             candidates, faces, config
         )
@@ -183,9 +183,10 @@ class GroundSegmenter:
         timer.mark('learning')
         surface, log_length_scale, _ = backend.estimate_surface(frame, learned.theta, config)
         timer.mark('surface')
-        # 6. Labels: ground up to the tolerance over the surface, or higher where it is rough.
+        # 6. Labels: ground up to the tolerance over the surface, or higher where it is rough; what
+        #    stands on the ground is labelled as faces are.
         height = sensor_height_of(pose)
-        labelled = backend.label_points(scan, faces, surface, relief, height, config)
+        labelled = backend.label_points(scan, shown, surface, relief, height, config)
         labelled.height[images.points] -= images.rise
         timer.mark('label')
         return Segmentation(
