@@ -108,7 +108,7 @@ def estimate_surface(
 OBSTACLE_DEPTH = 1.0
 """Height over which the lowest returns of obstacles are spread [m]."""
 ODDS_IN_FACE = 4.0
-"""Least obstacles for each ground among the candidates in vertical faces."""
+"""Lower bound of the odds that a candidate in a vertical face is an obstacle."""
 MOST_DOUBT = 30.0
 """Logarithm of odds that are as good as infinite."""
 ROUNDING, ROUNDING_SINGLE = 1e-12, 1e-6

@@ -176,10 +176,11 @@ def reachable(
 ) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Which of the candidates can be reached from enough seeds in steps over `allowed` ones.
 
-    Gentle steps are taken in any case, steep and long ones where they form a front, side by side:
-    those to a car are few. None leads up or down beside returns that are too steep (`is_steep`).
-    A front may mix falls and steps down. A fall counts from terrain only: what is seen over a
-    hedge is below its top. Heights of the candidates are over the plane near the sensor.
+    Gentle steps are taken anywhere, steep and long ones only in a front, side by side with others:
+    few lead to a car. Near returns that are steeper than terrain (`is_steep`, (C,)) no step is
+    gentle. A front may mix falls and steps down. A fall is taken only between terrain: what is
+    seen over a hedge is below its top. Heights of the candidates are over the plane near the
+    sensor.
 
     Returns those before falls in their segment, those behind and below one, and those that stand
     on the ground, see `_entered`, three (C,): across a ditch the terrain is that before it.
