@@ -83,7 +83,9 @@ def find_relief(
         _set_pieces(below, is_known_below, is_behind, pieces)
     _set_pieces(terrain, is_known, ~is_behind, pieces)
     for c in range(len(z)):
-        z[c] = candidates.z[c] - height_at(pieces, candidates.x[c], candidates.y[c])
+        u = from_first_middle(candidates.x[c], np.float64)
+        v = from_first_middle(candidates.y[c], np.float64)
+        z[c] = candidates.z[c] - height_in(pieces[np.uintp(u), np.uintp(v)], u, v)
     return False
 
 
@@ -100,9 +102,7 @@ def _set_pieces(
             k = _place(i, j)
             if chosen[k]:
                 corners = terrain[k], terrain[k + _WIDTH], terrain[k + 1], terrain[k + 1 + _WIDTH]
-                level, along_u, along_v, twist = piece_of(*corners)
-                pieces[i, j, 0], pieces[i, j, 1] = level, along_u
-                pieces[i, j, 2], pieces[i, j, 3] = along_v, twist
+                pieces[i, j] = piece_of(*corners)
 
 
 @jit()
@@ -128,14 +128,6 @@ def _behind_of(
     _fill(share, is_seen)
     result: BoolArray = is_seen & (share == 0.0)
     return result
-
-
-@jit()
-def height_at(pieces: FloatArray, x: float, y: float) -> float:
-    """Height of the relief at a place [m]."""
-    u, v = from_first_middle(x, np.float64), from_first_middle(y, np.float64)
-    height: float = height_in(pieces[np.uintp(u), np.uintp(v)], u, v)
-    return height
 
 
 @jit()
@@ -175,7 +167,7 @@ def _fit_planes(
         sums = _sums_around(x, y, z, height, weight, square)
         for k in range(_N_SQUARES):
             if number[k] > 0:
-                _set_plane(sums[k], plane[k])
+                plane[k] = plane_of(sums[k])
         for c in range(len(x)):
             if reached[c]:
                 there = height_of(plane[square[c]], x[c], y[c])
@@ -185,16 +177,10 @@ def _fit_planes(
             k = _place(i, j)
             # Most squares have no terrain about them.
             if sums[k, 0] >= MIN_WEIGHT:
-                _set_plane(sums[k], plane[k])
+                plane[k] = plane_of(sums[k])
                 is_known[k] = True
                 terrain[k] = height_of(plane[k], middle_of(i), middle_of(j))
     return terrain, is_known
-
-
-@jit()
-def _set_plane(sums: FloatArray, plane: FloatArray) -> None:
-    """Set mean and slopes of a plane by its sums (9,)."""
-    plane[0], plane[1], plane[2], plane[3], plane[4] = plane_of(sums)
 
 
 @jit()
@@ -282,7 +268,7 @@ class _Walk(NamedTuple):
     """What the steps taken so far lead to."""
 
     parent: IntArray  # (C,) a tree for each group of candidates that steps join
-    is_raised: BoolArray  # (C,) candidates that are raised
+    is_raised: BoolArray  # (C,) allowed candidates that are raised
     part: IntArray  # (C,) as `parent`, by steps between raised candidates alone
     is_foot: BoolArray  # (C,) raised candidates with a neighbour that is not
     is_entry: BoolArray  # (C,) those that a step from it leads to
@@ -300,13 +286,12 @@ def reachable(
     """See the plain `reachable`, of which the third result is `stands`, to be set."""
     r, n = candidates.r, len(candidates.r)
     allowed, is_steep = np.empty(n, np.bool_), np.empty(n, np.bool_)
-    for c in range(n):
-        tile = np.uintp(candidates.tile[c])
-        allowed[c], is_steep[c] = r[c] < REACH and not faces.is_face[tile], faces.is_steep[tile]
     marks = np.zeros((4, n), np.bool_)
     walk = _Walk(np.arange(n), marks[0], np.arange(n), marks[1], marks[2], marks[3])
     for c in range(n):
-        walk.is_raised[c] = candidates.z[c] + height > RAISED
+        tile = np.uintp(candidates.tile[c])
+        allowed[c], is_steep[c] = r[c] < REACH and not faces.is_face[tile], faces.is_steep[tile]
+        walk.is_raised[c] = allowed[c] and candidates.z[c] + height > RAISED
     steep, down = _step_along(candidates, allowed, is_steep, walk)
     for aside in range(1, N_ASIDE + 1):
         _step_aside(candidates, allowed, is_steep, aside, walk)
@@ -316,17 +301,15 @@ def reachable(
     _leave_out_not_entered(candidates, walk, is_terrain, stands)
     parent, n_seeds = walk.parent, np.zeros(n, np.int64)
     for c in range(n):
-        if walk.is_fallen[c] and is_terrain[c] and is_terrain[c - 1]:
+        walk.is_fallen[c] &= is_terrain[c] and is_terrain[c - 1]
+        if walk.is_fallen[c]:
             _join(parent, c - 1, c)
-        else:
-            walk.is_fallen[c] = False
     for c in range(n):
         parent[c] = _root(parent, c)
         is_near = allowed[c] and r[c] < growth.seed_range
         if is_near and abs(candidates.z[c] + height) < growth.seed_height_tolerance:
             n_seeds[parent[c]] += 1
-    for c in range(n):
-        is_terrain[c] &= n_seeds[parent[c]] >= MIN_SEEDS
+    is_terrain &= n_seeds[parent] >= MIN_SEEDS
     return _sides_of(candidates, is_terrain, walk.is_fallen)
 
 
@@ -335,15 +318,14 @@ def _sides_of(
     candidates: Candidates, reached: BoolArray, is_fallen: BoolArray
 ) -> tuple[BoolArray, BoolArray]:
     """Candidates that are `reached`: those before falls, and those behind and below one."""
-    offsets, before, behind = candidates.offsets, reached.copy(), np.zeros_like(reached)
+    offsets, behind = candidates.offsets, np.zeros_like(reached)
     for m in range(len(offsets) - 1):
         edge = -np.inf
         for c in range(offsets[m], offsets[m + 1]):
             if is_fallen[c] and reached[c]:
                 edge = candidates.z[c - 1]
-            is_behind = candidates.z[c] < edge - STEEP
-            before[c], behind[c] = reached[c] and not is_behind, reached[c] and is_behind
-    return before, behind
+            behind[c] = reached[c] and candidates.z[c] < edge - STEEP
+    return reached & ~behind, behind
 
 
 @jit()
@@ -370,17 +352,15 @@ def _leave_out_not_entered(
     """See the plain `_entered`. A part of raised terrain is reached as a whole, or not at all."""
     offsets, is_before = candidates.offsets, np.zeros(len(is_terrain), np.bool_)
     for m in range(len(offsets) - 1):
-        sees_lower = False
-        for c in range(offsets[m + 1] - 1, offsets[m] - 1, -1):
-            is_before[c] = sees_lower and is_terrain[c] and walk.is_raised[c]
-            sees_lower |= is_terrain[c] and not walk.is_raised[c]
-    entry, foot, before = (
-        _widths(candidates, walk.part, walk.is_entry),
-        _widths(candidates, walk.part, walk.is_foot),
-        _widths(candidates, walk.part, is_before),
-    )
+        first = offsets[m]
+        for low in range(first, offsets[m + 1]):
+            if is_terrain[low] and not walk.is_raised[low]:
+                is_before[first:low], first = walk.is_raised[first:low], low
+    entry = _widths(candidates, walk.part, walk.is_entry)
+    foot = _widths(candidates, walk.part, walk.is_foot)
+    before = _widths(candidates, walk.part, is_before)
     for c in range(len(is_terrain)):
-        if is_terrain[c] and walk.is_raised[c]:
+        if walk.is_raised[c]:
             part = _root(walk.part, c)
             is_terrain[c] = entry[part] >= MIN_ENTRY
             has_foot = min(foot[part], before[part]) >= MIN_ENTRY
@@ -416,8 +396,7 @@ def _step_along(
     others that lead down.
     """
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
-    steep, n = np.empty(len(r), np.int64), 0
-    down, n_down = np.empty(len(r), np.int64), 0
+    is_end, is_end_down = np.zeros(len(r), np.bool_), np.zeros(len(r), np.bool_)
     for m in range(len(offsets) - 1):
         for c in range(offsets[m] + 1, offsets[m + 1]):
             dr, rise = r[c] - r[c - 1], z[c] - z[c - 1]
@@ -434,13 +413,9 @@ def _step_along(
                 if is_sheer and (is_taken or not falls(dr, rise)):
                     _mark_raised(walk.is_raised, c - 1, c, walk.is_foot)
             walk.is_fallen[c] = not is_taken and falls(dr, rise)
-            if is_taken:
-                steep[n] = c
-                n += 1
-            if walk.is_fallen[c] or (is_taken and rise < 0.0):
-                down[n_down] = c
-                n_down += 1
-    return steep[:n], down[:n_down]
+            is_end[c] = is_taken
+            is_end_down[c] = walk.is_fallen[c] or (is_taken and rise < 0.0)
+    return np.flatnonzero(is_end), np.flatnonzero(is_end_down)
 
 
 @jit()
@@ -465,13 +440,8 @@ def _step_in_front(
     Falls that are not in one are none.
     """
     offsets, n_segments = candidates.offsets, len(candidates.offsets) - 1
-    starts, segment = np.zeros(n_segments + 1, np.int64), np.empty(len(steep), np.int64)
-    k = 0
-    for m in range(n_segments):
-        while k < len(steep) and steep[k] < offsets[m + 1]:
-            segment[k] = m
-            k += 1
-        starts[m + 1] = k
+    starts = np.searchsorted(steep, offsets)
+    segment = np.searchsorted(offsets, steep, side='right') - 1
     front = np.arange(len(steep))
     for aside in range(1, N_ASIDE + 1):
         for k in range(len(steep)):
