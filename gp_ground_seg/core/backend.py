@@ -75,13 +75,5 @@ def make_backend(runtime: RuntimeConfig) -> Backend:
     return NumbaBackend()
 
 
-def partly_compiled(*stages: str) -> Backend:
-    """Backend of compiled stages, but for some, which are numpy's: these are not compiled."""
-    backend = make_backend(RuntimeConfig())
-    for stage in stages:
-        setattr(backend, stage, getattr(NumpyBackend, stage))
-    return backend
-
-
 def _warn_slow(reason: str, more: object) -> None:
     log_once(logging.WARNING, 'numba %s: using numpy, several times slower (%s)', reason, more)

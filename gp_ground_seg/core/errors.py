@@ -15,8 +15,6 @@ from typing import Any, SupportsInt
 
 LOGGER = logging.getLogger('gp_ground_seg')
 """Of the whole library."""
-Receive = Callable[[int, str], object]
-"""Takes the severity of a message, as in `logging`, and its text."""
 
 
 class GroundSegError(Exception):
@@ -98,8 +96,10 @@ def log_once(level: int, text: str, *values: object) -> None:
 
 
 @contextmanager
-def messages_passed_to(receive: Receive, level: int = logging.INFO) -> Iterator[None]:
-    """Call `receive` with each message of that severity or more within the block."""
+def messages_passed_to(
+    receive: Callable[[int, str], object], level: int = logging.INFO
+) -> Iterator[None]:
+    """Call `receive` with severity and text of each message of a `level` or more in the block."""
     handler, before = logging.Handler(), LOGGER.level
     handler.emit = lambda record: receive(record.levelno, record.getMessage())  # type: ignore
     LOGGER.addHandler(handler)

@@ -93,9 +93,8 @@ class GroundModel:
         origin = place[0], place[1], place[2]
         with np.errstate(invalid='ignore'):
             height = ((points.astype(np.float64) - origin) @ rotation(roll, pitch).T)[..., 2]
-        knots, rest = numbers['range'][0], (numbers['std'], numbers['length_scale'])
-        model = cls(knots, height, *rest, roll, pitch, origin)
-        with np.errstate(invalid='ignore'):
+            knots, rest = numbers['range'][0], (numbers['std'], numbers['length_scale'])
+            model = cls(knots, height, *rest, roll, pitch, origin)
             strays = np.abs(points - model.knot_points()).max(axis=-1)
         # Where x and y are NaN and z is not, so is the distance, and the knot is no near one.
         near = (strays <= 1e-5 * (1.0 + knots)) | np.isnan(height)

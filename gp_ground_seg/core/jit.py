@@ -19,7 +19,7 @@ import os
 import stat
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib import metadata
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -187,7 +187,7 @@ def _save(save: Callable[..., Any], folder: Path, checksum: Path, *arguments: An
     """Let numba `save` what it has compiled; a full disk is a warning."""
     try:
         save(*arguments)
-        checksum.write_bytes(_digest_of(checksum))
+        checksum.write_bytes(_digest_of(_files_of(checksum)))
         _list(folder, checksum)
     except OSError as error:
         _log_not_kept(error)
@@ -198,12 +198,12 @@ def _save(save: Callable[..., Any], folder: Path, checksum: Path, *arguments: An
 def _files_of(checksum: Path) -> list[Path]:
     """Return the files in which numba keeps the code of a function."""
     name = glob.escape(checksum.name.removesuffix(_CHECKSUM))
-    return sorted(checksum.parent.glob(f'{name}-*.nb[ic]'))
+    return [*checksum.parent.glob(f'{name}-*.nb[ic]')]
 
 
-def _digest_of(checksum: Path) -> bytes:
-    digest = hashlib.sha256()
-    for path in _files_of(checksum):
+def _digest_of(files: Iterable[Path], begin: str = '') -> bytes:
+    digest = hashlib.sha256(begin.encode())
+    for path in sorted(files):
         digest.update(path.name.encode() + b'\0' + path.read_bytes())
     return digest.digest()
 
@@ -211,7 +211,7 @@ def _digest_of(checksum: Path) -> bytes:
 def _is_whole(checksum: Path) -> bool:
     """Whether the files of a function are those that were written."""
     try:
-        return checksum.read_bytes() == _digest_of(checksum)
+        return checksum.read_bytes() == _digest_of(_files_of(checksum))
     except OSError:
         return False
 
@@ -294,10 +294,7 @@ def _require_private(folder: Path) -> None:
 def _digest() -> str:
     """Name of what the code was compiled from: sources, where they lie, and versions."""
     versions = [sys.version, np.__version__, *map(metadata.version, ('numba', 'llvmlite'))]
-    digest = hashlib.sha256('\n'.join([str(_CORE), *versions]).encode())
-    for source in sorted(_CORE.rglob('*.py')):
-        digest.update(source.name.encode() + b'\0' + source.read_bytes())
-    return digest.hexdigest()[:16]
+    return _digest_of(_CORE.rglob('*.py'), '\n'.join([str(_CORE), *versions])).hex()[:16]
 
 
 def has_to_compile() -> bool:

@@ -68,27 +68,6 @@ class FitReport:
     n_pseudo_inputs: int  #: pseudo-inputs of the latent process
     backend: str  #: ``numba`` or ``numpy``
 
-    @classmethod
-    def of(cls, frame: Segmentation) -> FitReport:
-        """Sum up one frame."""
-        learned = frame.learned
-        values, names = np.exp(learned.theta), theta_names(len(learned.theta))
-        n_inliers = int(frame.surface.inlier.sum())
-        return cls(
-            mode='fixed' if learned.status == 'kept' else 'every_frame',
-            status=learned.status,
-            n_evaluations=learned.n_evaluations,
-            objective=learned.objective / n_inliers if n_inliers else float('nan'),
-            theta={name: float(value) for name, value in zip(names, values, strict=True)},
-            at_bound=tuple(n for n, hit in zip(names, learned.at_bound, strict=True) if hit),
-            n_segments=int(np.isfinite(frame.surface.mean[:, 0]).sum()),
-            n_candidates=len(frame.candidates.r),
-            n_inliers=n_inliers,
-            n_lines=len(frame.lines.slope),
-            n_pseudo_inputs=len(frame.pseudo.r_bar),
-            backend=frame.backend,
-        )
-
 
 class Segment(NamedTuple):
     """One segment of a scan: what the processes of the paper observe, and what they predict.
@@ -233,7 +212,23 @@ class Segmentation:
     @cached_property
     def fit(self) -> FitReport:
         """Outcome of the learning and of the inlier growth."""
-        return FitReport.of(self)
+        learned = self.learned
+        values, names = np.exp(learned.theta), theta_names(len(learned.theta))
+        n_inliers = int(self.surface.inlier.sum())
+        return FitReport(
+            mode='fixed' if learned.status == 'kept' else 'every_frame',
+            status=learned.status,
+            n_evaluations=learned.n_evaluations,
+            objective=learned.objective / n_inliers if n_inliers else float('nan'),
+            theta={name: float(value) for name, value in zip(names, values, strict=True)},
+            at_bound=tuple(n for n, hit in zip(names, learned.at_bound, strict=True) if hit),
+            n_segments=int(np.isfinite(self.surface.mean[:, 0]).sum()),
+            n_candidates=len(self.candidates.r),
+            n_inliers=n_inliers,
+            n_lines=len(self.lines.slope),
+            n_pseudo_inputs=len(self.pseudo.r_bar),
+            backend=self.backend,
+        )
 
     @cached_property
     def corrected(self) -> CorrectedSurface:

@@ -353,8 +353,7 @@ def warm_up(config: Config | None = None, backend: Backend | None = None) -> Bac
     are learned whatever ``learning.mode`` is. Raises a MissingDependencyError if
     ``runtime.backend`` is numba and numba is not installed.
     """
-    config = config or Config()
-    config = config.replace(**{'learning.mode': 'every_frame'})
+    config = (config or Config()).replace(**{'learning.mode': 'every_frame'})
     segmenter = GroundSegmenter(config, backend=backend)
     azimuth, r = np.meshgrid(np.linspace(-3.0, 3.0, 400), np.geomspace(2.5, 30.0, 30))
     xyz = np.stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full_like(r, -1.73)], axis=-1)

@@ -59,11 +59,9 @@ def initialize(words: Sequence[str], context: Any = None) -> None:
     from rclpy.utilities import remove_ros_args
 
     _check_surroundings(words)
-    with start_errors():
-        other_words = remove_ros_args(list(words))[1:]
     parser = argparse.ArgumentParser(prog=words[0], usage='%(prog)s [--ros-args ...]')
-    parser.parse_args(other_words)
     with start_errors():
+        parser.parse_args(remove_ros_args(list(words))[1:])
         options = SignalHandlerOptions.NO
         rclpy.init(args=list(words), context=context, signal_handler_options=options)
 

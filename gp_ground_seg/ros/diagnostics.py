@@ -17,7 +17,7 @@ from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config, DiagnosticsConfig
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.core.result import Segmentation
-from gp_ground_seg.ros.input import STEADY_CLOCK, CloudSubscription, seconds_of
+from gp_ground_seg.ros.input import STEADY_CLOCK, CloudSubscription, stamp_of
 
 RATE_WINDOW = 10.0  # time over which the rate is taken [s]
 LOG_PERIOD = 60.0  # time between two lines of the log on the clouds so far [s]
@@ -71,7 +71,7 @@ class InputTask:
         self._last_arrival = now
         self._n_arrived += 1
         self._arrivals.append(now)
-        self._stamp, self.frame = seconds_of(cloud.header.stamp), cloud.header.frame_id
+        self._stamp, self.frame = 1e-9 * stamp_of(cloud.header), cloud.header.frame_id
         self._fields = ' '.join(field.name for field in cloud.fields)
 
     def refused(self, reason: str) -> None:
@@ -297,20 +297,15 @@ class Diagnostics:
         n_done, n_lost = self.processing.n_processed, self.processing.n_dropped
         return f'{n_done} clouds segmented, {n_lost} lost, {self.input.n_refused} refused'
 
-    def _report(self) -> list[Status]:
-        """Return the status of each task."""
-        now, ros_time = time.monotonic(), 1e-9 * self._node.get_clock().now().nanoseconds
-        limits = self._config.diagnostics
-        return [
-            self.input.report(now, ros_time, limits),
+    def _publish(self) -> None:
+        limits, now = self._config.diagnostics, self._node.get_clock().now()
+        statuses = [
+            self.input.report(time.monotonic(), 1e-9 * now.nanoseconds, limits),
             self.processing.report(limits),
             model_status(self._newest, self._config.frame.level),
         ]
-
-    def _publish(self) -> None:
-        array = DiagnosticArray()
-        array.header.stamp = self._node.get_clock().now().to_msg()
-        node_name, statuses = self._node.get_fully_qualified_name(), self._report()
+        array, node_name = DiagnosticArray(), self._node.get_fully_qualified_name()
+        array.header.stamp = now.to_msg()
         said = '; '.join(f'{own.task} {own.level.name}: {own.message}' for own in statuses)
         self._node.get_logger().info(
             f'so far: {self.summary()}; {said}',

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping
 from statistics import median
 from typing import Any
 
-from builtin_interfaces.msg import Time as TimeMessage
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -17,6 +16,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
 
 from gp_ground_seg.core.errors import ConfigError
 
@@ -159,12 +159,13 @@ class CloudSubscription:
     def _receive(self, cloud: PointCloud2, info: dict[str, Any]) -> None:
         n_lost = self._lost_before(info.get('publication_sequence_number'))
         self._size = len(cloud.data)
-        self._note_stamp(seconds_of(cloud.header.stamp))
+        stamp = stamp_of(cloud.header)
+        self._note_stamp(1e-9 * stamp)
         # All are stamps of the system clock; 0 where the middleware gives none.
         now = time.time_ns()
         if ros_now := self._node.get_clock().now().nanoseconds:
             sent = ros_now - now + (info.get('source_timestamp') or now)
-            self._ages.append(1e-9 * sent - seconds_of(cloud.header.stamp))
+            self._ages.append(1e-9 * (sent - stamp))
         wait = max(0.0, 1e-9 * (now - (info.get('received_timestamp') or now)))
         self.callback(cloud, time.monotonic() - wait, n_lost)
 
@@ -252,6 +253,6 @@ class CloudSubscription:
         self._node.get_logger().info(words)
 
 
-def seconds_of(stamp: TimeMessage) -> float:
-    """Return the time of a header [s]."""
-    return float(stamp.sec + 1e-9 * stamp.nanosec)
+def stamp_of(header: Header) -> int:
+    """Return the stamp of a header [ns]."""
+    return int(10**9 * header.stamp.sec + header.stamp.nanosec)

@@ -67,11 +67,14 @@ def compile_all() -> None:
 
 
 def compile_but(*stages: str) -> None:
-    """Compile the code of a frame but for some stages."""
-    from gp_ground_seg.core.backend import partly_compiled
+    """Compile the code of a frame but for some stages, which numpy does."""
+    from gp_ground_seg.core.backend import NumpyBackend, make_backend
     from gp_ground_seg.core.segmenter import warm_up
 
-    warm_up(backend=partly_compiled(*stages))
+    backend = make_backend(Config().runtime)
+    for stage in stages:
+        setattr(backend, stage, getattr(NumpyBackend, stage))
+    warm_up(backend=backend)
 
 
 class BackendLoader(threading.Thread):

@@ -32,7 +32,7 @@ from gp_ground_seg.data.point_cloud2 import (
     read_xyz,
     select_points,
 )
-from gp_ground_seg.ros.input import seconds_of
+from gp_ground_seg.ros.input import stamp_of
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
@@ -199,7 +199,7 @@ class OutputPublishers:
 
     def publish(self, segmented: SegmentedCloud) -> None:
         """Publish all outputs of a cloud, or none if one cannot be built."""
-        seconds = seconds_of(segmented.cloud.header.stamp)
+        seconds = 1e-9 * stamp_of(segmented.cloud.header)
         period, self._stamp = seconds - self._stamp, seconds
         messages = [
             (publisher, output.build(segmented))

@@ -39,8 +39,7 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     if spec.type is float:
         result.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
     elif spec.type is int:
-        assert low is not None and high is not None
-        result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+        result.integer_range = [IntegerRange(from_value=low, to_value=high)]
     return result
 
 

@@ -18,11 +18,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from gp_ground_seg.core.errors import (
-    GroundSegError,
-    MissingDependencyError,
-    install_hint,
-)
+from gp_ground_seg.core.errors import GroundSegError, MissingDependencyError, install_hint
 from gp_ground_seg.ros.arguments import check_middleware, initialize, start_errors
 
 ROS_WHEELS = "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"

@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.time import Time
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu, PointCloud2
 from std_msgs.msg import Header
 
@@ -26,7 +27,7 @@ from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.core.parameters.config import NO_FRAME, Config
 from gp_ground_seg.core.pipeline.points import angles_of
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
-from gp_ground_seg.ros.input import STEADY_CLOCK
+from gp_ground_seg.ros.input import STEADY_CLOCK, stamp_of
 
 KEPT_JUMP = 1.0  # after a longer jump back in time, transforms are forgotten [s]
 MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]
@@ -69,14 +70,7 @@ def rotation_of(rotation: Quaternion) -> FloatArray:
     if not abs(square - 1.0) < 1e-3:
         given = f'({x:g}, {y:g}, {z:g}, {w:g}) of length {square**0.5:g}'
         raise PointCloudError(f'quaternion {given}: must be 1')
-    matrix: FloatArray = np.array(
-        [
-            [square - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), square - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), square - 2.0 * (x * x + y * y)],
-        ]
-    )
-    matrix /= square
+    matrix: FloatArray = Rotation.from_quat([x, y, z, w]).as_matrix()
     return matrix
 
 
@@ -140,11 +134,6 @@ class Kept(list[tuple[int, bytes]]):
         beside = self.beside(stamp)
         found, self[beside] = self[beside], [(own, b'') for own, _ in self[beside]]
         return [message for _, message in found if message]
-
-
-def stamp_of(header: Header) -> int:
-    """Return the stamp of a header [ns]."""
-    return int(10**9 * header.stamp.sec + header.stamp.nanosec)
 
 
 def stamp_in(message: bytes, begin: int) -> int:

@@ -206,7 +206,7 @@ def test_code_is_not_read_from_where_others_can_put_it(program):
     *_, folder = program.run()
     plant(index := program.code(kind='nbi'))
     checksum = index.with_name('small.double.sha256')
-    checksum.write_bytes(jit_module._digest_of(checksum))
+    checksum.write_bytes(jit_module._digest_of(jit_module._files_of(checksum)))
     Path(folder).chmod(0o701)
     assert program.run() == NOT_KEPT
     assert 'others can open' in program.stderr

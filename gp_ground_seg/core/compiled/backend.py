@@ -90,8 +90,8 @@ class NumbaBackend:
         if not config.surface.look_aside:
             return relief, candidates, faces
         growth, stands = numbers_of(config.growth), np.zeros(len(z), dtype=np.bool_)
-        is_level = relief_.find_relief(candidates, faces, height, growth, relief.pieces, z, stands)
-        over = candidates if is_level else candidates._replace(z=z)
+        relief_.find_relief(candidates, faces, height, growth, relief.pieces, z, stands)
+        over = candidates if relief.is_level else candidates._replace(z=z)
         return relief, over, with_standing(faces, candidates.tile, stands)
 
     def learn_frame(self, frame: Frame, config: Config) -> Learned:

@@ -65,10 +65,10 @@ def find_relief(
     pieces: FloatArray,
     z: FloatArray,
     stands: BoolArray,
-) -> bool:
-    """Set the pieces of the relief, and heights of candidates over it; return whether it is level.
+) -> None:
+    """Set the pieces of the relief, and heights of candidates over it; not where it is level.
 
-    Where it is, they are not set. `stands` (C,) becomes true of what stands on the ground.
+    `stands` (C,) becomes true of what stands on the ground.
     """
     before, behind = reachable(candidates, faces, height, growth, stands)
     terrain, is_known = _fit_planes(candidates, before, height)
@@ -76,7 +76,7 @@ def find_relief(
     if behind.any():
         below, is_known_below = _fit_planes(candidates, behind, height)
     if max(np.abs(terrain).max(), np.abs(below).max()) <= FADED:
-        return True
+        return
     is_behind = np.zeros(_N_SQUARES, np.bool_)
     if is_known_below.any():
         is_behind = _behind_of(candidates, before, is_known, behind, is_known_below)
@@ -86,7 +86,6 @@ def find_relief(
         u = from_first_middle(candidates.x[c], np.float64)
         v = from_first_middle(candidates.y[c], np.float64)
         z[c] = candidates.z[c] - height_in(pieces[np.uintp(u), np.uintp(v)], u, v)
-    return False
 
 
 @jit()

@@ -36,8 +36,6 @@ from gp_ground_seg.core.pipeline.vertical_faces import (
 # greatest height. The first row also holds the origin of the tile.
 _TOP, _X, _Y, _BASE = SUMS, SUMS + 1, SUMS + 2, SUMS + 3
 N_COLUMNS = SUMS + 4
-NOT_TALL = -1
-"""Row of a tile without a tall return."""
 
 
 @jit(entry=True)
@@ -101,12 +99,12 @@ def _mark_scattered(
 
 @jit()
 def _select_tall(tiles: Tiles, height: float, label: LabelConfig) -> tuple[CellArray, CellArray]:
-    """List the tiles to examine, (K,), and the first of the two rows of each, or `NOT_TALL`."""
+    """List the tiles to examine, (K,), and the first of the two rows of each, or `OUTSIDE`."""
     extremes, n_tiles, n_tall = tiles.extremes, len(tiles.extremes), 0
     tall, tile_to_row = np.empty(n_tiles, np.int32), np.empty(n_tiles, np.int32)
     for t in range(n_tiles):
         low, high = np.float64(extremes[t, 0]), np.float64(extremes[t, 1])
-        tile_to_row[t] = NOT_TALL
+        tile_to_row[t] = OUTSIDE
         if is_examined(high - low, low + height, tiles.place[t], label):
             tall[n_tall], tile_to_row[t] = t, 2 * n_tall
             n_tall += 1
@@ -137,7 +135,7 @@ def _sum_returns(
         if tile[i] == OUTSIDE:
             continue
         k = tile_to_row[np.uintp(tile[i])]
-        if k == NOT_TALL:
+        if k == OUTSIDE:
             continue
         low = sums[np.uintp(k)]
         above = np.float64(z[i]) - low[_BASE]

@@ -119,8 +119,7 @@ class GridConfig(ParameterGroup):
     @property
     def first_width(self) -> float:
         """Width of the first bin from `start` on, the narrowest of those beyond [m]."""
-        width: float = (self.r_max - self.start) / float(self.n_bins) ** self.bin_growth
-        return width
+        return float((self.r_max - self.start) / float(self.n_bins) ** self.bin_growth)
 
     @property
     def n_near(self) -> int:
@@ -340,9 +339,7 @@ class Config(ParameterGroups):
             low, high = float(self[lower]), float(self[upper])
             if not low < high:
                 raise ConfigError(f'{lower} = {low:g}: must be below {upper} = {high:g}')
-        grid = self.grid
-        # Bins widen with range: the first one is the narrowest.
-        width = grid.first_width
+        grid, width = self.grid, self.grid.first_width
         if width < NARROWEST_BIN:
             raise ConfigError(
                 f'grid.n_bins = {grid.n_bins}, grid.bin_growth = {grid.bin_growth:g} between '
@@ -432,11 +429,10 @@ PRESETS = {preset.name: preset for preset in _PRESETS}
 
 def find_preset(name: str) -> Preset:
     """Return the preset `name`; raises ConfigError with the nearest one and all others."""
-    preset = PRESETS.get(name)
-    if preset is None:
+    if name not in PRESETS:
         hint = did_you_mean(name, PRESETS)
         raise ConfigError(f'unknown preset {name!r}{hint} (there are {", ".join(PRESETS)})')
-    return preset
+    return PRESETS[name]
 
 
 def config_of(given: Config | str | Path | Mapping[str, Any] | None, **values: Any) -> Config:
@@ -465,6 +461,5 @@ def config_of(given: Config | str | Path | Mapping[str, Any] | None, **values: A
         config = find_preset(str(given)).config
     names = {spec.name.replace('.', '_'): spec.name for spec in parameter_specs()}
     if unknown := [name for name in values if name not in names]:
-        hint = did_you_mean(unknown[0], names)
-        raise ConfigError(f'unknown parameter {unknown[0]}{hint}')
+        raise ConfigError(f'unknown parameter {unknown[0]}{did_you_mean(unknown[0], names)}')
     return config.replace(**{names[name]: value for name, value in values.items()})

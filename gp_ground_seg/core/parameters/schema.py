@@ -198,8 +198,7 @@ class ParameterGroups:
         specs = cls.specs()
         if name in specs:
             return specs[name]
-        members = [known for known in specs if known.startswith(f'{name}.')]
-        if members:
+        if members := [known for known in specs if known.startswith(f'{name}.')]:
             raise ConfigError(f'{name!r} is a group of parameters: {", ".join(members)}')
         raise ConfigError(f'unknown parameter {name!r}{did_you_mean(name, specs)}')
 

@@ -349,8 +349,7 @@ def best_of(planes: FloatArray, cells: LowestPoints, least: float) -> tuple[Plan
 
 def supports_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
     """Support of planes (P, 3) by the points near them, (P,)."""
-    height, slope_x, slope_y = planes.T[:, :, None]
-    plane = height, slope_x, slope_y
+    plane: Any = planes.T[:, :, None]
     support = support_by(cells.x, cells.y, cells.z, cells.inverse, cells.weight, plane)
     supports: FloatArray = levelness(planes[:, 1], planes[:, 2]) * support.sum(axis=1)
     return supports
@@ -510,6 +509,5 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundP
 
 def is_new(sector: IntArray) -> BoolArray:
     """Which cells are the nearest of a sector: they come sector by sector, from near to far."""
-    result = np.ones(len(sector), dtype=np.bool_)
-    result[1:] = sector[1:] != sector[:-1]
+    result: BoolArray = np.diff(sector, prepend=-1) != 0
     return result

@@ -111,10 +111,7 @@ def _points_at(place: Direction, xyz: PointArray, rounding: float) -> IntArray:
     """Return the points (N, 3) that are at `place` but for `rounding`."""
     tolerance, x = rounding * max(map(abs, place)), xyz[:, 0]
     # Few points have this x, mostly none, and only those are looked at further.
-    is_near = np.abs(x - place[0]) <= tolerance if tolerance else x == place[0]
-    if not is_near.any():
-        return np.zeros(0, np.int64)
-    near = np.flatnonzero(is_near)
+    near = np.flatnonzero(np.abs(x - place[0]) <= tolerance if tolerance else x == place[0])
     for axis in (1, 2):
         near = near[np.abs(xyz[near, axis] - place[axis]) <= tolerance]
     return near

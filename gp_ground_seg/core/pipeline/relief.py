@@ -25,6 +25,7 @@ from gp_ground_seg.core.frame import (
     IntArray,
     PointArray,
     Values,
+    as_index,
 )
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config
@@ -154,20 +155,14 @@ def _is_behind(sides: list[Candidates], terrains: list[tuple[FloatArray, BoolArr
 
     As a mask, (N_SIDES - 1, N_SIDES - 1). Pieces with terrain of both are of that before.
     """
-    from scipy.ndimage import distance_transform_cdt
-
-    rings = np.full((2, N_SIDES - 1, N_SIDES - 1), N_SIDES, dtype=np.int32)
-    for ring, side, (_, is_known) in zip(rings, sides, terrains, strict=True):
-        known = is_known[square_of(side.x).astype(np.int64), square_of(side.y).astype(np.int64)]
-        u, v = (
-            from_first_middle(place[known], np.float64).astype(np.int64)
-            for place in (side.x, side.y)
-        )
-        is_empty = np.ones(ring.shape, dtype=np.bool_)
-        is_empty[u, v] = False
-        if len(u):
-            distance_transform_cdt(is_empty, 'chessboard', distances=ring)
-    result: BoolArray = rings[1] < rings[0]
+    share, is_seen = np.zeros((2, N_SIDES - 1, N_SIDES - 1))
+    for is_before, side, (_, is_known) in zip((1.0, 0.0), sides, terrains, strict=True):
+        known = is_known[as_index(square_of(side.x)), as_index(square_of(side.y))]
+        u, v = (as_index(from_first_middle(p[known], np.float64)) for p in (side.x, side.y))
+        share[u, v] += is_before
+        is_seen[u, v] = 1.0
+    # Of those without terrain, all that are as near to terrain before falls get a share of it.
+    result: BoolArray = is_seen.any() & (filled(share, is_seen > 0.0) == 0.0)
     return result
 
 
@@ -185,8 +180,7 @@ def reachable(
     Returns those before falls in their segment, those behind and below one, and those that stand
     on the ground, see `_entered`, three (C,): across a ditch the terrain is that before it.
     """
-    steps = _steps(candidates)
-    steps = steps.where(allowed[steps.first] & allowed[steps.second])
+    steps = _steps(candidates, allowed)
     first, second, is_fall = steps.first, steps.second, steps.is_fall
     rise = candidates.z[second] - candidates.z[first]
     over_steep, is_near = is_steep[first] | is_steep[second], ~steps.is_long & ~is_fall
@@ -291,7 +285,7 @@ def _groups(n: int, first: IntArray, second: IntArray) -> IntArray:
 
 
 class _Steps(NamedTuple):
-    """Steps between neighbours among the candidates, which may be too steep."""
+    """Steps between neighbours among the allowed candidates, which may be too steep."""
 
     first: IntArray  # (S,) candidates at the near end, and
     second: IntArray  # (S,) at the other one
@@ -299,13 +293,8 @@ class _Steps(NamedTuple):
     is_long: BoolArray  # (S,) longer than `largest_gap`, with the slope of the terrain before it
     is_fall: BoolArray  # (S,) see `falls`
 
-    def where(self, kept: BoolArray) -> _Steps:
-        """Those `kept`, (S,)."""
-        columns: Any = (column[kept] for column in self)
-        return _Steps(*columns)
 
-
-def _steps(candidates: Candidates) -> _Steps:
+def _steps(candidates: Candidates, allowed: BoolArray) -> _Steps:
     """List the steps to the next candidate of a segment, and to those in the segments beside.
 
     These are the two next to it in range; there no step is long, and none a fall. The slope before
@@ -314,7 +303,7 @@ def _steps(candidates: Candidates) -> _Steps:
     r, z, segment = candidates.r, candidates.z, candidates.segment
     n_segments, n = len(candidates.offsets) - 1, len(r)
     apart = 2.0 * float(r.max(initial=0.0)) + 1.0  # of one segment's ranges and the next one's
-    key, here = segment * apart + r, np.arange(n)
+    key = segment * apart + r
     dr, rise = np.diff(r), np.diff(z)
     before = np.searchsorted(key, key[:-1] - 0.5 * dr, side='right') - 1
     has_before = (before >= 0) & (segment[before] == segment[:-1])
@@ -324,8 +313,9 @@ def _steps(candidates: Candidates) -> _Steps:
         is_long = has_before & (dr <= longest_gap(r[1:])) & goes_on(rise / dr, slope_before)
     is_long &= is_far
     is_fall = ~is_long & (is_far | ~can_be) & falls(dr, rise)
-    along = np.flatnonzero((~is_far | is_long | is_fall) & (segment[1:] == segment[:-1]))
-    first, second, length = [along], [along + 1], [dr[along]]
+    is_step = allowed[1:] & allowed[:-1] & (~is_far | is_long | is_fall)
+    along = np.flatnonzero(is_step & (segment[1:] == segment[:-1]))
+    parts = [(along, along + 1, dr[along])]
     for aside in range(1, N_ASIDE + 1):
         beside = (segment + aside) % n_segments
         behind = np.searchsorted(key, beside * apart + r)
@@ -333,13 +323,13 @@ def _steps(candidates: Candidates) -> _Steps:
         for there in (behind - 1, np.minimum(behind, n - 1)):
             dr = np.abs(r[there] - r)
             is_near = (segment[there] == beside) & (dr <= 0.5 * largest_gap(r))
-            first.append(here[is_near])
-            second.append(there[is_near])
-            length.append(np.sqrt(dr * dr + across * across)[is_near])
-    near = np.concatenate(first)
-    n_aside = len(near) - len(along)
+            is_near &= allowed & allowed[there]
+            length = np.sqrt(dr * dr + across * across)
+            parts.append((np.flatnonzero(is_near), there[is_near], length[is_near]))
+    first, second, length = map(np.concatenate, zip(*parts, strict=True))
+    n_aside = len(first) - len(along)
     is_long, is_fall = (np.pad(kind[along], (0, n_aside)) for kind in (is_long, is_fall))
-    return _Steps(near, np.concatenate(second), np.concatenate(length), is_long, is_fall)
+    return _Steps(first, second, length, is_long, is_fall)
 
 
 @shared
