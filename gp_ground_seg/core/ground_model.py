@@ -86,15 +86,14 @@ class GroundModel:
                 'must have at least 1 segment and 2 knots'
             )
         numbers = {name: column.astype(np.float64) for name, column in columns.items()}
-        roll, pitch, *place = (
+        roll, pitch, x, y, z = (
             float(numbers[name][0, 0])
             for name in ('roll', 'pitch', 'origin_x', 'origin_y', 'origin_z')
         )
-        origin = place[0], place[1], place[2]
         with np.errstate(invalid='ignore'):
-            height = ((points.astype(np.float64) - origin) @ rotation(roll, pitch).T)[..., 2]
+            height = ((points.astype(np.float64) - (x, y, z)) @ rotation(roll, pitch).T)[..., 2]
             knots, rest = numbers['range'][0], (numbers['std'], numbers['length_scale'])
-            model = cls(knots, height, *rest, roll, pitch, origin)
+            model = cls(knots, height, *rest, roll, pitch, (x, y, z))
             strays = np.abs(points - model.knot_points()).max(axis=-1)
         # Where x and y are NaN and z is not, so is the distance, and the knot is no near one.
         near = (strays <= 1e-5 * (1.0 + knots)) | np.isnan(height)

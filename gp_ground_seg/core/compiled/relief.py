@@ -217,33 +217,26 @@ def _sums_around(
 
 @jit()
 def _fill(terrain: FloatArray, is_known: BoolArray) -> None:
-    """See the plain `filled`."""
-    ring, following = np.empty(_N_SQUARES, np.int64), np.empty(_N_SQUARES, np.int64)
+    """See the plain `filled`; unknown heights are 0 before."""
     is_waiting, mean = np.zeros(_N_SQUARES, np.bool_), np.empty(_N_SQUARES)
-    n = 0
     for i in range(N_SIDES):
         for j in range(N_SIDES):
-            k = _place(i, j)
-            is_waiting[k] = not is_known[k]
-            if is_known[k]:
-                ring[n] = k
-                n += 1
-            else:
-                terrain[k] = 0.0
-    while n > 0:
-        n_following = 0
-        for q in range(n):
+            is_waiting[_place(i, j)] = not is_known[_place(i, j)]
+    ring = np.flatnonzero(is_known)
+    while len(ring) > 0:
+        following, n = np.empty(_N_SQUARES, np.int64), 0
+        for q in range(len(ring)):
             for step in range(-_WIDTH, _WIDTH + 1, _WIDTH):
                 for k in range(ring[q] + step - 1, ring[q] + step + 2):
                     if is_waiting[k]:
                         is_waiting[k] = False
-                        following[n_following] = k
-                        n_following += 1
-        for q in range(n_following):
-            mean[q] = _mean_around(terrain, is_known, following[q])
-        for q in range(n_following):
-            terrain[following[q]], is_known[following[q]] = mean[q], True
-        ring, following, n = following, ring, n_following
+                        following[n] = k
+                        n += 1
+        ring = following[:n]
+        for q in range(n):
+            mean[q] = _mean_around(terrain, is_known, ring[q])
+        for q in range(n):
+            terrain[ring[q]], is_known[ring[q]] = mean[q], True
 
 
 @jit()
