@@ -70,8 +70,7 @@ def rotation_of(rotation: Quaternion) -> FloatArray:
     if not abs(square - 1.0) < 1e-3:
         given = f'({x:g}, {y:g}, {z:g}, {w:g}) of length {square**0.5:g}'
         raise PointCloudError(f'quaternion {given}: must be 1')
-    matrix: FloatArray = Rotation.from_quat([x, y, z, w]).as_matrix()
-    return matrix
+    return np.asarray(Rotation.from_quat([x, y, z, w]).as_matrix())
 
 
 def _translation_of(transform: Any, way: str) -> tuple[float, float, float]:

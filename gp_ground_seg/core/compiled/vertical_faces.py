@@ -51,21 +51,20 @@ def find_faces(
     sums = _sum_returns(scan.xyz, tiles, tall, config.cell_size, label, tile_to_row)
     square = np.empty(len(tall))
     for k in range(len(tall)):
-        low, high = sums[2 * k], sums[2 * k + 1]
+        t, low, high = np.uintp(tall[k]), sums[2 * k], sums[2 * k + 1]
         reaches = max(low[_TOP], high[_TOP]) > face_height(label)
         is_face = reaches and is_vertical(low, high, config)
-        faces.is_face[np.uintp(tall[k])] = is_face
-        faces.is_steep[np.uintp(tall[k])] = reaches and is_steep(high)
-        is_occluded = is_face and is_base_occluded(low, high, config)
-        faces.has_occluded_base[np.uintp(tall[k])] = is_occluded
+        faces.is_face[t] = is_face
+        faces.is_steep[t] = reaches and is_steep(high)
+        faces.has_occluded_base[t] = is_face and is_base_occluded(low, high, config)
         square[k] = UNKNOWN if is_face else scatter_square(low, high)
     _mark_scattered(tiles, tall, square, height, label, faces)
     for m in range(len(candidates.offsets) - 1):
         before = 0.0
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
-            r, t = candidates.r[c], candidates.tile[c]
+            r, tile = candidates.r[c], candidates.tile[c]
             if is_beyond_edge(r - before, r, candidates.z[c] + height, label):
-                faces.has_occluded_base[t] = faces.is_face[t]
+                faces.has_occluded_base[tile] = faces.is_face[tile]
             before = r
 
 
@@ -101,10 +100,9 @@ def _mark_scattered(
 def _select_tall(tiles: Tiles, height: float, label: LabelConfig) -> tuple[CellArray, CellArray]:
     """List the tiles to examine, (K,), and the first of the two rows of each, or `OUTSIDE`."""
     extremes, n_tiles, n_tall = tiles.extremes, len(tiles.extremes), 0
-    tall, tile_to_row = np.empty(n_tiles, np.int32), np.empty(n_tiles, np.int32)
+    tall, tile_to_row = np.empty(n_tiles, np.int32), np.full(n_tiles, OUTSIDE, np.int32)
     for t in range(n_tiles):
         low, high = np.float64(extremes[t, 0]), np.float64(extremes[t, 1])
-        tile_to_row[t] = OUTSIDE
         if is_examined(high - low, low + height, tiles.place[t], label):
             tall[n_tall], tile_to_row[t] = t, 2 * n_tall
             n_tall += 1

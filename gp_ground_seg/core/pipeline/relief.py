@@ -155,14 +155,15 @@ def _is_behind(sides: list[Candidates], terrains: list[tuple[FloatArray, BoolArr
 
     As a mask, (N_SIDES - 1, N_SIDES - 1). Pieces with terrain of both are of that before.
     """
-    share, is_seen = np.zeros((2, N_SIDES - 1, N_SIDES - 1))
+    share = np.zeros((N_SIDES - 1, N_SIDES - 1))
+    is_seen = np.zeros(share.shape, dtype=np.bool_)
     for is_before, side, (_, is_known) in zip((1.0, 0.0), sides, terrains, strict=True):
         known = is_known[as_index(square_of(side.x)), as_index(square_of(side.y))]
         u, v = (as_index(from_first_middle(p[known], np.float64)) for p in (side.x, side.y))
         share[u, v] += is_before
-        is_seen[u, v] = 1.0
+        is_seen[u, v] = True
     # Of those without terrain, all that are as near to terrain before falls get a share of it.
-    result: BoolArray = is_seen.any() & (filled(share, is_seen > 0.0) == 0.0)
+    result: BoolArray = is_seen.any() & (filled(share, is_seen) == 0.0)
     return result
 
 
