@@ -326,15 +326,17 @@ def _step(walk: _Walk, a: int, b: int) -> None:
     _join(walk.parent, a, b)
     if walk.is_raised[a] and walk.is_raised[b]:
         _join(walk.part, a, b)
-    else:
-        _mark_raised(walk.is_raised, a, b, walk.is_entry)
+    elif walk.is_raised[a]:
+        walk.is_entry[a] = True
+    elif walk.is_raised[b]:
+        walk.is_entry[b] = True
 
 
 @jit()
-def _mark_raised(is_raised: BoolArray, a: int, b: int, marks: BoolArray) -> None:
+def _mark_foot(walk: _Walk, a: int, b: int) -> None:
     """Mark the one of two candidates that is raised, if the other is not."""
-    marks[a] |= is_raised[a] and not is_raised[b]
-    marks[b] |= is_raised[b] and not is_raised[a]
+    if walk.is_raised[a] != walk.is_raised[b]:
+        walk.is_foot[a if walk.is_raised[a] else b] = True
 
 
 @jit()
@@ -344,10 +346,10 @@ def _leave_out_not_entered(
     """See the plain `_entered`. A part of raised terrain is reached as a whole, or not at all."""
     offsets, is_before = candidates.offsets, np.zeros(len(is_terrain), np.bool_)
     for m in range(len(offsets) - 1):
-        first = offsets[m]
-        for low in range(first, offsets[m + 1]):
-            if is_terrain[low] and not walk.is_raised[low]:
-                is_before[first:low], first = walk.is_raised[first:low], low
+        sees_lower = False
+        for c in range(offsets[m + 1] - 1, offsets[m] - 1, -1):
+            is_before[c] = sees_lower and walk.is_raised[c]
+            sees_lower |= is_terrain[c] and not walk.is_raised[c]
     entry = _widths(candidates, walk.part, walk.is_entry)
     foot = _widths(candidates, walk.part, walk.is_foot)
     before = _widths(candidates, walk.part, is_before)
@@ -403,7 +405,7 @@ def _step_along(
                     continue
                 is_sheer = over_steep or not can_step(dr, rise, math.inf)
                 if is_sheer and (is_taken or not falls(dr, rise)):
-                    _mark_raised(walk.is_raised, c - 1, c, walk.is_foot)
+                    _mark_foot(walk, c - 1, c)
             walk.is_fallen[c] = not is_taken and falls(dr, rise)
             is_end[c] = is_taken
             is_end_down[c] = walk.is_fallen[c] or (is_taken and rise < 0.0)
@@ -498,7 +500,7 @@ def _step_aside(
                     if can_be and is_gentle(rise, over_steep):
                         _step(walk, c, there)
                     elif over_steep or not can_be:
-                        _mark_raised(walk.is_raised, c, there, walk.is_foot)
+                        _mark_foot(walk, c, there)
 
 
 @jit()
