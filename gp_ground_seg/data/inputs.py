@@ -74,7 +74,9 @@ class Inputs(Sequence[Input]):
                 yield f'{self.path}: {place}', time, raw
 
     def __getitem__(self, index: Any) -> Any:
-        """Return one cloud, not read yet."""
+        """Return one cloud, not read yet; IndexError beyond the last."""
+        if not 0 <= index < len(self):
+            raise IndexError(f'{self.path}: {index} of {len(self)} clouds')
         return next(islice(self, index, None))
 
 

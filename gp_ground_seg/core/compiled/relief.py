@@ -262,8 +262,8 @@ class _Walk(NamedTuple):
     parent: IntArray  # (C,) a tree for each group of candidates that steps join
     is_raised: BoolArray  # (C,) allowed candidates that are raised
     part: IntArray  # (C,) as `parent`, by steps between raised candidates alone
-    is_foot: BoolArray  # (C,) raised candidates with a neighbour that is not
-    is_entry: BoolArray  # (C,) those that a step from it leads to
+    is_foot: BoolArray  # (C,) raised candidates, to which it is too steep from one that is not
+    is_entry: BoolArray  # (C,) raised candidates that a step from one that is not leads to
     is_fallen: BoolArray  # (C,) candidates that a fall leads to
 
 

@@ -65,7 +65,7 @@ MIN_WEIGHT = 1.5
 """Least weight of a plane, where a square with candidates counts one."""
 RAISED, MIN_ENTRY = 0.3, 1.5
 """Height from which terrain is raised [m]; width over which steps must lead up to it [m], as few
-lead to a car. What has a foot so wide, and fewer steps, stands on the ground."""
+lead to a car. A raised part that fewer lead to is an object, if its foot is seen so wide."""
 FADED, FADE_WIDTH = 0.15, 0.3
 """Height of the terrain up to which the relief is level [m]; within this much more it grows to it
 [m]."""
@@ -376,9 +376,9 @@ def can_step(distance: Values, rise: Values, most: float) -> Values:
 
 @shared
 def is_gentle(rise: Values, over_steep: Values) -> Values:
-    """Whether a step may be taken anywhere.
+    """Whether a step may be taken without others side by side with it.
 
-    Where the returns about it are too steep for terrain, it may only be as high as they scatter.
+    Over returns that are too steep for terrain it rises or falls by noise alone.
     """
     return np.abs(rise) <= choose(over_steep, STEP_TOLERANCE, GENTLE)
 
