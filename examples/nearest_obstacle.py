@@ -4,9 +4,13 @@ While `gp-ground-seg node --ros-args -r points:=YOUR_TOPIC -p output.min_height:
 runs, start this; with --ros-args -r obstacles:=/NAMESPACE/obstacles if the node has a namespace.
 """
 
+import signal
+import threading
+
 import numpy as np
 import rclpy
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.data.point_cloud2 import read_xyz
@@ -30,13 +34,14 @@ class NearestObstacle(Node):
 
 def main():
     """Run until Ctrl-C."""
-    rclpy.init()
-    try:
-        rclpy.spin(NearestObstacle())
-    except KeyboardInterrupt:
-        pass
-    finally:
-        rclpy.try_shutdown()
+    # A handler that raises, or that shuts rclpy down, does so within a call of rclpy.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    stop = threading.Event()
+    signal.signal(signal.SIGINT, lambda *_: stop.set())
+    node = NearestObstacle()
+    while not stop.is_set():
+        rclpy.spin_once(node, timeout_sec=0.25)
+    rclpy.shutdown()
 
 
 if __name__ == '__main__':
