@@ -105,9 +105,8 @@ def test_labels_are_the_same_with_any_number_of_workers(root, scheduler, tmp_pat
     before = dict(os.environ)
     for n, words in (('1', ['--workers', '1']), ('2', ['--scheduler', scheduler])):
         assert run('segment', root, '-o', tmp_path / n, *words) == 0
-        said = capsys.readouterr()
-        assert f'in each of {n} worker' in said.out
-        assert said.err == '' or '--scheduler' in words
+        out, err = capsys.readouterr()
+        assert f'in each of {n} worker' in out and (err == '' or '--scheduler' in words)
         assert label_files(tmp_path / n) == label_files(tmp_path / '0')
     # Dask sets variables of malloc, with which each frame takes its memory from the system.
     assert dict(os.environ) == before
@@ -273,6 +272,5 @@ def test_one_process_needs_no_dask(root, tmp_path):
         'import sys; from gp_ground_seg.cli.main import main; main(sys.argv[1:]); '
         'assert not {"dask", "distributed"} & set(sys.modules)'
     )
-    scan = root / 'sequences/00/velodyne/000000.bin'
-    words = 'segment', scan, '-o', tmp_path / 'out', '--set', 'runtime.backend=numpy'
-    run_python(code, *words)
+    words = ['--set', 'runtime.backend=numpy', '-o', tmp_path / 'out']
+    run_python(code, 'segment', root / 'sequences/00/velodyne/000000.bin', *words)
