@@ -2,15 +2,12 @@
 
 The node runs in a second process and is sent clouds through ROS at several rates, in a namespace
 of a random name: frames of a KITTI_ROOT, or simulated scans of a sensor. What follows
-``--ros-args`` goes to the node. With --first-minute, rows are of 60 s at 10 Hz from where a node
-without compiled code begins to listen, on all cores and on one, or beside a busy loop on each.
+``--ros-args`` goes to the node.
 """
 
 import argparse
-import contextlib
 import itertools
 import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -116,24 +113,16 @@ def cpu_of(pid):
     return sum(map(int, fields[11:15])) / os.sysconf('SC_CLK_TCK')
 
 
-@contextlib.contextmanager
-def started(ros_args):
-    """A session, and the node of a second process that it talks to."""
-    with (
-        private_session('node_bench') as (session, own),
-        tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
-        NodeProcess(Path(folder, 'log'), [*own, *ros_args]) as node,
-    ):
-        yield session, node
-        node.check()
-
-
 def measure(clouds, ros_args):
     """Results at each rate, with what the node says it dropped, and its CPU time of a cloud."""
     from diagnostic_msgs.msg import DiagnosticArray
 
     stamped = restamped(clouds, 1_700_000_000)
-    with started(ros_args) as (session, node):
+    with (
+        private_session('node_bench') as (session, own),
+        tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
+        NodeProcess(Path(folder, 'log'), [*own, *ros_args]) as node,
+    ):
         arrays, results = [], []
         session.node.create_subscription(DiagnosticArray, '/diagnostics', arrays.append, 10)
         Link(session, node).connect(clouds[0])
@@ -148,40 +137,8 @@ def measure(clouds, ros_args):
             found['CPU [ms]'] = 1e3 * (cpu_of(node.pid) - cpu) / N_SENT
             n_dropped = dropped_by_node(session, arrays) - before
             results.append({**found, 'reported': n_dropped})
+        node.check()
     return results
-
-
-def first_minute(clouds, cores, is_busy, ros_args):
-    """Results of the first minute of a node on some `cores`, with nothing compiled before."""
-    before, beside, compiled = os.sched_getaffinity(0), [], []
-    with tempfile.TemporaryDirectory() as cache, contextlib.ExitStack() as stack:
-        os.environ['NUMBA_CACHE_DIR'] = cache
-        os.sched_setaffinity(0, cores)  # also of what is started here
-        session, node = stack.enter_context(started(ros_args))
-        for core in cores if is_busy else ():
-            os.sched_setaffinity(0, {core})
-            beside.append(subprocess.Popen([sys.executable, '-c', 'while True: pass']))
-        os.sched_setaffinity(0, before)
-        try:
-            probe = Probe(session)
-            session.wait_for(lambda: any('listening' in x for x in node.log_lines()), 60.0)
-            start = time.monotonic()
-
-            def note():
-                if not compiled and node.is_compiled():
-                    compiled.append(time.monotonic() - start)
-
-            found = probe.send(itertools.islice(restamped(clouds, 1), N_SENT), 10.0, note)
-            cpu = cpu_of(node.pid)
-            while not compiled and time.monotonic() < start + 240.0:
-                session.sleep(0.2)
-                note()
-        finally:
-            for process in beside:
-                process.kill()
-                process.wait()
-    words = f'{len(cores)}{", busy" if is_busy else ""}'
-    return {'cores': words, **found, 'CPU [s]': cpu, 'numba after [s]': (*compiled, np.nan)[0]}
 
 
 def main():
@@ -192,7 +149,6 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('root', nargs='?')
     parser.add_argument('--sensor', choices=SENSORS, default='hdl-64e', help='that is simulated')
-    parser.add_argument('--first-minute', action='store_true')
     given = parser.parse_args(words)
     if given.root:
         scans = [frame.points for frame in frames(given.root)[:N_READ]]
@@ -202,18 +158,10 @@ def main():
             .points for k in range(N_SIMULATED)
         ]  # fmt: skip
     clouds = [scan_cloud(points, 0, FRAME_ID) for points in scans]
-    if given.first_minute:
-        every = os.sched_getaffinity(0)
-        rows = [
-            first_minute(clouds, cores, is_busy, ros_args)
-            for cores, is_busy in ((every, False), ({min(every)}, False), (every, True))
-        ]
-    else:
-        rows = measure(clouds, ros_args)
     n_points = sum(map(len, scans)) / len(scans)
     source = given.root or f'simulated {given.sensor}'
     print(f'{source}: {len(scans)} clouds of {n_points:.0f} points')
-    print(pd.DataFrame(rows).round(1).to_string(index=False))
+    print(pd.DataFrame(measure(clouds, ros_args)).round(1).to_string(index=False))
     print(machine_line(describe_environment(), 'numba'))
 
 

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from rooms import ROOM
+from rooms import HALL, ROOM, SMALL_ROOM
 from test_sensor_pose import (
     SEGMENTER,
     SENSORS,
@@ -29,7 +29,7 @@ from gp_ground_seg.core.pipeline.sensor_pose import (
     NO_HEIGHT,
 )
 from gp_ground_seg.lab import simulation
-from gp_ground_seg.lab.simulation import SCENES, Scene, simulate_scan
+from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, SCENES, VLP_16, Scene, simulate_scan
 from gp_ground_seg.lab.simulation import terrain as landforms
 from gp_ground_seg.lab.simulation.objects import floating_box
 
@@ -228,22 +228,33 @@ def test_a_sensor_that_looks_ahead_stands_on_the_level_that_ends_there(edge, dro
         assert pose.measured.plane.other_height == pytest.approx(1.7 - drop, abs=0.1)
 
 
-@pytest.mark.parametrize(
-    ('sensor', 'height'), [(SMALL_VLP, 0.5), (SMALL_VLP, 1.0), (SMALL_OS1, 0.8)]
-)
-def test_a_narrow_jetty_is_the_ground_and_cars_around_are_not(sensor, height):
-    jetty = landforms.polyline(1.3, [(-2.0, -1.5), (-1.7, 0.0), (1.7, 0.0), (2.0, -1.5)])
-    for scene, own in ((Scene('jetty', jetty), height), ('traffic_jam', height + 0.8)):
-        pose = pose_of(scan_of(scene, sensor, own, seed=3).points)
-        assert pose.is_level and pose.height == pytest.approx(own, abs=0.05)
+JETTY = landforms.polyline(1.3, [(-2.0, -1.5), (-1.7, 0.0), (1.7, 0.0), (2.0, -1.5)])
+UPWARDS = tuple(np.radians(np.linspace(52, -52, 64)))
+NEAR = [
+    # Floors under a ceiling, also the little that is seen of a small room, and among desks.
+    *((HALL, *one, 0, 0.05) for one in ((VLP_16, 0.4), (OS1_128, 0.5), (HDL_64E, 1.73))),
+    (SMALL_ROOM, simulation.SENSORS['mid-360'], 0.45, 0, 0.05),
+    (desks(2.4), dataclasses.replace(SMALL_OS1, elevations=UPWARDS), 0.95, 0, 0.05),
+    # A narrow jetty is the ground, and cars around are not.
+    *(
+        (scene, sensor, height + more, 3, 0.05)
+        for sensor, height in ((SMALL_VLP, 0.5), (SMALL_VLP, 1.0), (SMALL_OS1, 0.8))
+        for scene, more in ((Scene('jetty', JETTY), 0.0), ('traffic_jam', 0.8))
+    ),
+    # Nor is a slope nearby.
+    *(
+        (scene, sensor, height, 2, 0.15)
+        for sensor, height in ((SMALL_HDL, 1.75), (SMALL_VLP, 0.8), (SMALL_OS1, 1.75))
+        for scene in ('valley', 'on_ramp')
+    ),
+]
 
 
-def test_a_floor_under_a_ceiling_is_found_among_desks():
-    upwards = dataclasses.replace(
-        SMALL_OS1, elevations=tuple(np.radians(np.linspace(52, -52, 64)))
-    )
-    pose = pose_of(scan_of(desks(2.4), upwards, 0.95).points)
-    assert pose.is_level and pose.height == pytest.approx(0.95, abs=0.05)
+@pytest.mark.parametrize(('scene', 'sensor', 'height', 'seed', 'tolerance'), NEAR)
+def test_the_ground_is_that_near_the_sensor(scene, sensor, height, seed, tolerance):
+    pose = pose_of(scan_of(scene, sensor, height, seed=seed).points)
+    assert pose.height_estimated and pose.is_level
+    assert pose.height == pytest.approx(height, abs=tolerance)
 
 
 @pytest.mark.parametrize('sensor', [SMALL_VLP, SMALL_OS1], ids=lambda s: s.name)
@@ -291,14 +302,6 @@ def test_a_cloud_in_another_frame_or_unit_is_named_and_its_origin_centres_it(sca
     np.testing.assert_allclose(model.knot_points() - move, ours.knot_points(), atol=1e-9)
     (height, _), (wanted, _) = model.at(*(points + move)[:, :2].T), ours.at(*points[:, :2].T)
     np.testing.assert_allclose(height - move[2], wanted, atol=1e-6)
-
-
-@SENSORS
-@pytest.mark.parametrize('scene', ['valley', 'on_ramp'])
-def test_a_slope_nearby_is_not_the_ground_of_the_robot(sensor, scene):
-    height = 0.8 if sensor is SMALL_VLP else 1.75
-    pose = pose_of(scan_of(scene, sensor, height, seed=2).points)
-    assert pose.is_level and pose.height == pytest.approx(height, abs=0.15)
 
 
 @SENSORS
