@@ -134,6 +134,9 @@ def test_code_is_compiled_once_said_once_and_then_loaded(program):
     assert Path(folder) in program.code().parents
     assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
     assert not list(program.folder.glob('__pycache__/*.nb[ic]'))
+    # It is not read from where others can put it.
+    Path(folder).chmod(0o701)
+    assert program.run() == NOT_KEPT and 'others can open' in program.stderr
 
 
 def test_code_lies_in_the_cache_of_the_user_by_default_and_never_in_the_current_folder(
@@ -200,17 +203,6 @@ def test_one_process_compiles_and_others_wait_for_its_files(program):
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert program.run(PATIENCE='0.2')[:4] == [42.0, 1, 1, False]
     assert program.run()[:4] == LOADED
-
-
-def test_code_is_not_read_from_where_others_can_put_it(program):
-    *_, folder = program.run()
-    plant(index := program.code(kind='nbi'))
-    checksum = index.with_name('small.double.sha256')
-    checksum.write_bytes(jit_module._digest_of(jit_module._files_of(checksum)))
-    Path(folder).chmod(0o701)
-    assert program.run() == NOT_KEPT
-    assert 'others can open' in program.stderr
-    assert not (program.folder / 'ran').exists()
 
 
 def test_a_folder_is_private_if_nobody_else_can_change_it_or_one_above(tmp_path):

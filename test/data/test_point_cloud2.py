@@ -4,7 +4,6 @@ import array
 import dataclasses
 import itertools
 import struct
-from typing import NamedTuple
 
 import bag_samples as samples
 import numpy as np
@@ -17,6 +16,7 @@ from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.bags import (
     cloud_from_columns,
     encode_cloud,
+    jazzy_types,
     stamp_of,
     with_stamp,
 )
@@ -29,24 +29,15 @@ CONTAINERS = [bytes, bytearray, memoryview, lambda b: array.array('B', b)]
 CONTAINERS += [lambda b: np.array(list(b), np.uint8)]
 
 
-class Field(NamedTuple):
-    name: str
-    offset: int
-    datatype: int
-    count: int = 1
+Field = jazzy_types().types['sensor_msgs/msg/PointField']
 
 
-@dataclasses.dataclass
-class Layout:
-    """The attributes of a message that are read."""
-
-    height: int
-    width: int
-    fields: list[Field]
-    is_bigendian: bool
-    point_step: int
-    row_step: int
-    data: object
+def cloud_of(height, width, fields, is_bigendian, point_step, row_step, data):
+    empty = cloud_from_columns((0, 0), 'lidar', {})
+    return dataclasses.replace(
+        empty, height=height, width=width, fields=fields, is_bigendian=is_bigendian,
+        point_step=point_step, row_step=row_step, data=data,
+    )  # fmt: skip
 
 
 @st.composite
@@ -65,7 +56,7 @@ def layouts(draw):
     raw = draw(st.binary(min_size=size, max_size=size))
     container = draw(st.sampled_from(CONTAINERS))
     big = draw(st.booleans())
-    return Layout(height, width, fields, big, offset, row_step, container(raw)), raw
+    return cloud_of(height, width, fields, big, offset, row_step, container(raw)), raw
 
 
 def all_points(layout, raw):
@@ -83,7 +74,7 @@ def test_coordinates_and_selections_agree_with_struct(case, random):
     layout, raw = case
     points = all_points(layout, raw)
     order = '>' if layout.is_bigendian else '<'
-    axes = sorted(field for field in layout.fields if field.name in 'xyz')
+    axes = [field for name in 'xyz' for field in layout.fields if field.name == name]
     expected = [
         struct.unpack_from(order + STRUCT_CODES[axis.datatype], point, axis.offset)[0]
         for point in points
@@ -119,7 +110,7 @@ def test_points_stay_and_columns_follow(case, data):
     new = wide.reshape(-1, step)[:, : layout.point_step]
     assert [row.tobytes() for row in new] == points
     wider = dataclasses.replace(
-        layout, fields=[Field(*column) for column in placed], data=bytes(wide),
+        layout, fields=[Field(*column, 1) for column in placed], data=bytes(wide),
         point_step=step, row_step=layout.width * step,
     )  # fmt: skip
     found = read_columns(wider, list(columns))
@@ -131,14 +122,16 @@ def test_points_stay_and_columns_follow(case, data):
 
 def kitti_layout(n=5, **changes):
     rng = np.random.default_rng(0)
-    fields = [Field(name, 4 * k, FLOAT32) for k, name in enumerate(('x', 'y', 'z', 'intensity'))]
+    fields = [
+        Field(name, 4 * k, FLOAT32, 1) for k, name in enumerate(('x', 'y', 'z', 'intensity'))
+    ]
     data = rng.normal(size=(n, 4)).astype('<f4').tobytes()
-    return dataclasses.replace(Layout(1, n, fields, False, 16, 16 * n, data), **changes)
+    return dataclasses.replace(cloud_of(1, n, fields, False, 16, 16 * n, data), **changes)
 
 
 def replaced(name, /, **changes):
     fields = kitti_layout().fields
-    return [field._replace(**changes) if field.name == name else field for field in fields]
+    return [dataclasses.replace(one, **(changes if one.name == name else {})) for one in fields]
 
 
 def test_coordinates_side_by_side_are_not_copied():
@@ -152,8 +145,8 @@ def test_coordinates_side_by_side_are_not_copied():
 
 
 def test_what_is_not_needed_is_not_checked():
-    assert read_xyz(Layout(0, 0, [], False, 0, 0, b'')).shape == (0, 3)
     cloud = cloud_from_columns((0, 0), 'lidar', {})
+    assert read_xyz(dataclasses.replace(cloud, fields=[])).shape == (0, 3)
     assert point_cloud2.select_points(cloud, np.zeros(0, dtype=bool)).width == 0
     layout = kitti_layout(row_step=0)
     np.testing.assert_array_equal(read_xyz(layout), read_xyz(kitti_layout()))
