@@ -1,16 +1,12 @@
-"""Both processes against the numbers of GPy, see `gpy_table`."""
+"""The surface against the numbers of GPy, see `gpy_table`; test_likelihood has theirs."""
 
 import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from gp_ground_seg import Config
-from gp_ground_seg.core.compiled import likelihood as compiled
-from gp_ground_seg.core.frame import Candidates, Frame, Inliers, Lines, PseudoInputs
-from gp_ground_seg.core.gp.likelihood import log_likelihood
-from gp_ground_seg.core.parameters.schema import numbers_of
+from gp_ground_seg.core.frame import Candidates, Frame, Lines, PseudoInputs
 
 TABLE = json.loads(Path(__file__).with_name('gpy.json').read_text())
 SEGMENTS, THETA = TABLE['segments'], np.log(TABLE['theta'])
@@ -40,9 +36,12 @@ def test_the_surface_is_that_of_gpy(backend):
     r, knots = column('r'), np.array(TABLE['knots'])
     n, n_bar = len(r), len(column('r_bar'))
     place, nowhere = np.zeros(n, np.int64), np.zeros(n, bool)
+    # Arrays as a frame has them: for others all would be compiled again.
+    knots.setflags(write=False)
+    tile = np.zeros(n, np.int32)
     # The last bin: all knots are wanted.
     candidates = Candidates(
-        r, column('z'), place + len(knots), np.ones(n), offsets('r'), place, r, 0.0 * r
+        r, column('z'), place + len(knots), np.ones(n), offsets('r'), tile, r, 0.0 * r
     )
     bar = np.zeros(n_bar, np.int64)
     pseudo = PseudoInputs(
@@ -56,17 +55,3 @@ def test_the_surface_is_that_of_gpy(backend):
     # Compiled code has length-scales in single precision.
     tolerance, expected = {'numpy': 1e-9, 'numba': 1e-6}[backend.name], column('expected')
     np.testing.assert_allclose(np.concatenate(found), expected, rtol=0.0, atol=tolerance)
-
-
-@pytest.mark.parametrize('by', ['numpy', 'numba'])
-def test_the_likelihood_and_its_gradient_are_those_of_gpy(by):
-    inliers = Inliers(
-        offsets('r'), column('r'), column('z'), np.zeros(len(column('r'))),
-        offsets('r_bar'), column('r_bar'), column('log_extent'), column('kind'),
-    )  # fmt: skip
-    arguments = THETA, inliers, numbers_of(CONFIG.observation), False
-    value, gradient = log_likelihood(*arguments)
-    if by == 'numba':
-        value = compiled.log_likelihood(*arguments, gradient)
-    assert value == pytest.approx(TABLE['log_likelihood'], rel=1e-9)
-    np.testing.assert_allclose(gradient, TABLE['gradient'], rtol=1e-6)

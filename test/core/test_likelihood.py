@@ -1,4 +1,4 @@
-"""Log marginal likelihood of a frame: gradient, reference, densities by others' code."""
+"""Log marginal likelihood of a frame: gradient, reference, GPy."""
 
 import functools
 import math
@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import reference_gp
+from test_gpy import CONFIG, TABLE, THETA, column, offsets
 
 from gp_ground_seg.core.compiled import likelihood as compiled
 from gp_ground_seg.core.frame import Inliers
@@ -98,6 +99,15 @@ def test_value_and_gradient_are_those_of_the_reference(likelihood, name, latent_
     error = np.abs(gradient - numeric) / np.maximum(np.abs(numeric), floor)
     assert error.max() <= 1e-6
     assert bars != 'none' or not gradient[2:].any()
+
+
+def test_value_and_gradient_are_those_of_gpy(likelihood):
+    places = column('r'), column('z'), np.zeros(len(column('r')))
+    bars = offsets('r_bar'), column('r_bar'), column('log_extent'), column('kind')
+    prior = numbers_of(CONFIG.observation)
+    value, gradient = likelihood(THETA, Inliers(offsets('r'), *places, *bars), prior, False)
+    assert value == pytest.approx(TABLE['log_likelihood'], rel=1e-9)
+    np.testing.assert_allclose(gradient, TABLE['gradient'], rtol=1e-6)
 
 
 NOISELESS, NOISELESS_LATENT = TYPICAL.copy(), TYPICAL.copy()
