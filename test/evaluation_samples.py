@@ -84,16 +84,6 @@ class HeightRule:
         return MethodResult(label.astype(np.uint8), surface)
 
 
-def write_two_drives(folder):
-    """Two sequences whose scans differ, so that what is learned from the first matters."""
-    for sequence, n_frames in (('00', 7), ('08', 5)):
-        for k in range(n_frames):
-            points, semantic = street(seed=k)
-            points[:, 2] += np.float32(0.01 * k) * np.sin(points[:, 0])
-            write_frame(folder, sequence, k, points, semantic)
-    return folder
-
-
 def label_files(folder):
     """Label files below a folder, by path; None for a link to nowhere."""
     return {

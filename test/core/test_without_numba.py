@@ -9,6 +9,8 @@ from conftest import REPOSITORY, hilly_scan, run_python
 from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.core.jit import HAVE_NUMBA
 
+# Fewer segments than by default: plain Python takes seconds for each frame.
+SEGMENTER = GroundSegmenter(grid_n_segments=36)
 SCRIPT = """
 import sys
 import numpy as np
@@ -17,7 +19,7 @@ if sys.argv[1] == 'blocked':
 from gp_ground_seg import Config, GroundSegmenter, GroundSegError
 points = np.load(sys.argv[2])
 for _ in range(2):
-    result = GroundSegmenter(Config()).segment(points)
+    result = GroundSegmenter(grid_n_segments=36).segment(points)
 np.savez(sys.argv[3], label=result.label, ground_z=result.ground_z)
 print(result.fit.backend)
 if sys.argv[1] == 'blocked':
@@ -42,7 +44,7 @@ def test_without_compiled_code_labels_are_the_same_and_one_line_says_so(tmp_path
     environment |= {'NUMBA_DISABLE_JIT': '1'} if case == 'plain' else {}
     words = case, tmp_path / 'points.npy', tmp_path / 'result.npz'
     said, errors = run_python(SCRIPT, *words, **environment)
-    result, expected = np.load(tmp_path / 'result.npz'), GroundSegmenter().segment(points)
+    result, expected = np.load(tmp_path / 'result.npz'), SEGMENTER.segment(points)
     np.testing.assert_array_equal(result['label'], expected.label)
     np.testing.assert_allclose(result['ground_z'], expected.ground_z, atol=1e-6)
     backend, *by_name = said.splitlines()

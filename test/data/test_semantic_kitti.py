@@ -1,37 +1,11 @@
 """SemanticKITTI folders: what is read, and what is refused."""
 
-import numpy as np
 import pytest
 from evaluation_samples import street, write_frame, write_streets
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data import semantic_kitti
-from gp_ground_seg.data.semantic_kitti import Frame, list_frames, list_sequences, read_points
-
-FLOATS = st.floats(-1e4, 1e4, width=32) | st.sampled_from([np.nan, np.inf, -np.inf])
-
-
-@given(
-    hnp.arrays('<f4', st.tuples(st.integers(0, 20), st.just(4)), elements=FLOATS),
-    hnp.arrays('<u4', st.integers(0, 20)),
-)
-def test_points_come_back_bit_for_bit_and_labels_are_the_lower_half(
-    tmp_path_factory, points, entries
-):
-    folder = tmp_path_factory.mktemp('frame')
-    points = np.vstack([points, np.ones((1, 4), '<f4')])
-    (folder / 'a.bin').write_bytes(points.tobytes())
-    read = read_points(folder / 'a.bin')
-    assert (read.dtype, read.shape) == (np.float32, points.shape)
-    assert read.tobytes() == points.tobytes()
-    assert read.flags.writeable
-    entries = np.resize(entries, len(points))
-    (folder / 'a.label').write_bytes(entries.tobytes())
-    frame = Frame('00', 'a', folder / 'a.bin', folder / 'a.label', 0.0)
-    assert frame.semantic.tolist() == [int(entry) % 65536 for entry in entries]
+from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences
 
 
 def test_sequences_and_frames_are_sorted_and_need_scans(tmp_path):

@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 from cli_runner import error_line, run
-from evaluation_samples import label_files, write_two_drives
+from evaluation_samples import label_files, write_streets
 
 from gp_ground_seg import __version__
 from gp_ground_seg.cli import segment as command
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures('compiled_code')
 @pytest.fixture(scope='module')
 def segmented(tmp_path_factory):
     """A data set, and the folder into which it has been segmented."""
-    root = write_two_drives(tmp_path_factory.mktemp('root'))
+    root = write_streets(tmp_path_factory.mktemp('root'), s00=7, s08=5)
     assert run('segment', root, '-o', root.parent / 'out', '--quiet') == 0
     return root, root.parent / 'out'
 

@@ -14,7 +14,7 @@ from functools import partial
 import pytest
 from cli_runner import INTERRUPTED, children, is_running, run, start, wait_for
 from conftest import run_python
-from evaluation_samples import label_files, write_streets, write_two_drives
+from evaluation_samples import label_files, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -33,7 +33,7 @@ pytestmark = [
 
 @pytest.fixture(scope='module')
 def root(tmp_path_factory):
-    return write_two_drives(tmp_path_factory.mktemp('root'))
+    return write_streets(tmp_path_factory.mktemp('root'), s00=7, s08=5)
 
 
 @pytest.fixture(scope='module')
