@@ -5,33 +5,23 @@ import itertools
 import numpy as np
 import pytest
 from conftest import scene_of, simulated
-from evaluation_samples import scores_of, write_frame, write_streets
+from evaluation_samples import scores_of, write_frame
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.parameters.config import PRESETS
 from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab import experiments, table1
 from gp_ground_seg.lab.experiments import MODELS, SimulatedFrame, load_scan, simulated_frames
-from gp_ground_seg.lab.scoring.evaluate import (
-    OURS,
-    PATCHWORKPP,
-    load_kitti,
-    make_scores,
-)
-from gp_ground_seg.lab.scoring.metrics import count_labels, height_sums, label_ratios
+from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP
+from gp_ground_seg.lab.scoring.metrics import height_sums
 from gp_ground_seg.lab.scoring.objects import CLASSES, count_objects
-from gp_ground_seg.lab.scoring.peers import InterpolationMethod, ground_points
+from gp_ground_seg.lab.scoring.peers import ground_points
 from gp_ground_seg.lab.scoring.report import records
 from gp_ground_seg.lab.scoring.tables import time_tables
 from gp_ground_seg.lab.simulation import Kind, semantic_kitti_labels
 from gp_ground_seg.lab.simulation.objects import object_heights
 
 FIXED = Config().replace(**{'learning.mode': 'fixed'})
-
-
-@pytest.fixture(scope='module')
-def frames(tmp_path_factory):
-    return labelled_frames(write_streets(tmp_path_factory.mktemp('kitti'), s00=2, s08=1))
 
 
 def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
@@ -43,20 +33,6 @@ def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     report = experiments.compare_models(frames, Config())
     constant, gradient, latent, _ = (row['rmse'] for row in records(report.tables['models'].frame))
     assert latent < 0.95 * min(constant, gradient)
-
-
-def test_pairs_are_differences_of_models_that_learn_alike():
-    frames = simulated_frames(['vlp-16'], ['ramp', 'bank'], 1, (0.0,))
-    tables = experiments.compare_models(frames, Config()).tables
-    of_models = {row['method']: row for row in records(tables['models'].frame)}
-    *alike, more, last = records(tables['pairs'].frame)
-    assert (more['pair'], more['theta']) == ('Z-L - Z-L', 'all learned - learned')
-    assert (last['pair'], last['theta']) == ('Z-L - interpolation', 'learned')
-    assert len(alike) == 6
-    for row in alike:
-        ours, other = (of_models[f'{name}, {row["theta"]}'] for name in row['pair'].split(' - '))
-        for name in ('iou', 'rmse'):
-            assert row[f'{name}_difference'] == pytest.approx(ours[name] - other[name])
 
 
 def test_steps_go_from_the_paper_to_the_parameters_given():
@@ -96,27 +72,6 @@ def test_interpolation_joins_lowest_points_that_are_not_too_steep():
     assert ground_points(r, z, -1.73) == ([0.0, 5.0, 10.0], [-1.73, -1.7, -1.2])
 
 
-def test_interpolation_has_the_median_of_three_segments_and_our_labels(frames):
-    scan = load_kitti(frames[0])
-    plain = InterpolationMethod(Config())
-    plain.run(scan.points)
-    result = plain.last
-    candidates, surface, segment = result.candidates, result.surface, 60
-    lines = []
-    for k in (segment - 1, segment, segment + 1):
-        own = candidates.segment == k
-        found = ground_points(candidates.r[own], candidates.z[own], -1.73)
-        lines.append(np.interp(surface.knots, *found))
-    known = np.isfinite(surface.mean[segment])
-    assert known.sum() > 5
-    # The height of the sensor is estimated; it only moves what lies before the first point.
-    far = known & (surface.knots > 8.0)
-    expected = np.median(lines, axis=0)[far]
-    np.testing.assert_allclose(surface.mean[segment][far], expected, atol=1e-9)
-    assert result.fit.mode == 'fixed'
-    assert label_ratios(count_labels(result.label, scan.truth))['iou'] > 0.9
-
-
 def test_scenes_without_a_free_lane_are_seen_from_the_origin_only():
     frames = simulated_frames(['vlp-16'], ['kerb', 'car_park'], 1, (0.0, 6.0))
     assert [frame[1:] for frame in frames] == [('kerb', 0, 0), ('kerb', 0, 6), ('car_park', 0, 0)]
@@ -137,43 +92,16 @@ def test_objects_of_a_simulated_scan_are_those_that_its_rays_hit(scene):
     np.testing.assert_array_equal(objects.object_id, made.object_id)
 
 
-def scored_by_hand(method, *ious, error, lost):
-    """Rows of a method on three scenes: errors of the height, and objects."""
-    height = height_sums(np.zeros(4), np.array([error, error, -3.0 * error, np.nan]))
-    scans, objects = [], []
-    for scene, iou in zip(('vlp-16 flat', 'vlp-16 ramp', 'os1 ramp'), ious, strict=True):
-        key = {'method': method, 'sequence': scene, 'index': ''}
-        labels = {'tp': iou, 'fp': 100 - iou, 'fn': 0, 'tn': 0}
-        counts = {'n_scans': 1, 'n_objects': 6, 'n_lost': lost}
-        scans.append({**key, 'cluster': scene, **height, **labels, **counts})
-        for name in ('vehicle', 'person', 'cyclist', 'low, 0.3 m'):
-            objects.append({**key, 'class': name, 'n_objects': 2, 'n_lost': lost})
-    return {'scans': scans, 'objects': objects}
-
-
-def test_scenes_by_hand():
-    """Of each scan the counts are those of test_objects.py."""
-    ours = scored_by_hand(OURS, 90, 80, 70, error=0.1, lost=0)
-    scores = make_scores([ours, scored_by_hand('x', 89, 81, 70, error=0.2, lost=1)])
-
-    def values(row, *names):
-        return [row[f'{who}{name}'] for name in names for who in ('', 'peer_')]
-
-    row = records(experiments._scene_table(scores).frame)[0]
-    assert (row['sensor'], row['scene']) == ('vlp-16', 'flat')
-    assert values(row, 'iou', 'lost_vehicles', 'lost_persons') == [0.9, 0.89, 0, 1, 0, 2]
-    assert values(row, 'rmse') == pytest.approx([*(np.sqrt(11 / 3) * np.array([0.1, 0.2]))])
-    assert (row['vehicles'], row['persons']) == (2, 4)
-    flat, ramp, total = records(experiments._rough_table(scores).frame)
-    assert [row['scene'] for row in (flat, ramp, total)] == ['flat', 'ramp', 'all']
-    names = 'n_scans', 'n_objects', 'n_lost', 'peer_n_lost'
-    assert [total[name] for name in names] == [3, 18, 0, 3]
-    assert values(ramp, 'iou') + values(total, 'iou') == pytest.approx(
-        [0.75, 0.755, 0.825, 0.8225]
-    )
-    row = records(experiments._low_table(scores).frame)[0]
-    assert row['things'] == 2 and values(row, 'low, 0.3 m') == [0.0, 0.5]
-    assert row['low, 0.2 m'] is None
+def test_a_row_of_rough_ground_has_means_over_sensors_and_sums_of_objects():
+    rows = [
+        {'sequence': f'{sensor} ramp', 'index': '', 'tp': hits, 'fp': 100 - hits, 'fn': 0, 'tn': 0,
+         'n_objects': 6, 'n_lost': 1, **height_sums(np.zeros(2), np.full(2, hits / 1000.0))}
+        for sensor, hits in (('vlp-16', 80), ('os1', 70))
+    ]  # fmt: skip
+    ramp, total = records(experiments._rough_table(scores_of(a=rows)).frame)
+    assert (ramp.pop('scene'), total.pop('scene')) == ('ramp', 'all')
+    expected = {'n_scans': 2, 'n_objects': 12, 'iou': 0.75, 'rmse': 0.075, 'n_lost': 2}
+    assert ramp == total == pytest.approx(expected)
 
 
 @pytest.mark.slow
