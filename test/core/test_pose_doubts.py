@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from conftest import simulated
 from rooms import HALL, ROOM, SMALL_ROOM
 from test_sensor_pose import (
     SEGMENTER,
@@ -29,7 +30,7 @@ from gp_ground_seg.core.pipeline.sensor_pose import (
     NO_HEIGHT,
 )
 from gp_ground_seg.lab import simulation
-from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, SCENES, VLP_16, Scene, simulate_scan
+from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, VLP_16, Scene
 from gp_ground_seg.lab.simulation import terrain as landforms
 from gp_ground_seg.lab.simulation.objects import floating_box
 
@@ -96,8 +97,7 @@ def test_the_origin_of_a_vehicle_on_a_slope_is_not_over_table_tops(scene):
     """Its ground lies at as many angles of depression as that of a low sensor."""
     for name in ('hdl-64e-vehicle', 'vlp-32c-pair'):
         mounted = dataclasses.replace(simulation.SENSORS[name], n_columns=600)
-        made = simulate_scan(SCENES[scene](0), mounted, np.random.default_rng(0))
-        pose = pose_of(made.points)
+        pose = pose_of(simulated(scene, mounted).points)
         assert abs(pose.height) < 0.2 and pose.warnings == ()
 
 

@@ -6,7 +6,7 @@ from itertools import cycle
 
 import numpy as np
 import pytest
-from conftest import fewer
+from conftest import fewer, simulated
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rooms import ROOM, room
@@ -19,7 +19,7 @@ from gp_ground_seg.core.pipeline.points import angles_of, rotate, rotation
 from gp_ground_seg.core.pipeline.sensor_pose import CLEAR_TILT, DEFAULT_HEIGHT
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.lab import simulation
-from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, SCENES, VLP_16, simulate_scan
+from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, SCENES, VLP_16
 
 # Scans of 100,000 points, too many for the compiled twins as plain Python.
 BACKEND = NumbaBackend() if JIT_ENABLED else NumpyBackend()
@@ -54,8 +54,7 @@ def tilted(points, roll, pitch):
 
 def scan_of(scene, sensor, height, seed=0, roll=0.0, pitch=0.0):
     mounted = dataclasses.replace(sensor, height=height, roll=roll, pitch=pitch)
-    made = SCENES[scene](seed) if isinstance(scene, str) else scene
-    return simulate_scan(made, mounted, np.random.default_rng(seed))
+    return simulated(scene, mounted, seed)
 
 
 def cluttered_plane(seed, height, roll, pitch):
