@@ -2,9 +2,8 @@
 
 A fault is one edit of a statement of a room, or of one of its files, drawn by a fixed seed. The
 modules of tests that name its file run against it, in a copy of the repository. RESULTS takes a
-line of JSON for each fault; a second run goes on where the first ended. Its draft, beside it, has
-the faults: copied, the same faults are run against another version, but for those whose statement
-is gone.
+line of JSON for each fault; a second run goes on where the first ended. The same code has the
+same faults, whatever its tests.
 """
 
 import ast
@@ -29,7 +28,6 @@ SECONDS = 90
 OPTIONS = ['-xq', '-p', 'no:cacheprovider', '-m', 'not slow', '--timeout=60']
 OPTIONS += ['-W', 'ignore:overflow encountered', '-W', 'ignore:Module already imported']
 NAMES = 'scope', 'first', 'last', 'kind', 'old', 'new'
-SAME = 'scope', 'old', 'new'  # of a statement that was moved
 PAIRS = (ast.Lt, ast.Gt), (ast.LtE, ast.GtE), (ast.Eq, ast.NotEq), (ast.Is, ast.IsNot)
 PAIRS += (ast.In, ast.NotIn), (ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.And, ast.Or)
 TURNED = {a: b for pair in PAIRS for a, b in (pair, pair[::-1])}
@@ -93,16 +91,12 @@ def edits(node, scope=''):
             yield from edits(child, scope)
 
 
-def faults_of(room, name='*.py'):
-    """Each fault of a room, or of its files of a name."""
-    paths = sorted((TREE / 'gp_ground_seg' / room).rglob(name))
-    trees = {str(path.relative_to(TREE)): ast.parse(path.read_text()) for path in paths}
-    return [{'file': file, **fault} for file, tree in trees.items() for fault in edits(tree)]
-
-
 def draw(room, name):
     """As many faults as NUMBERS has, one in a line, of each kind as many where there are."""
-    faults, n_of_kind = faults_of(room, name), Counter()
+    paths = sorted((TREE / 'gp_ground_seg' / room).rglob(name))
+    trees = {str(path.relative_to(TREE)): ast.parse(path.read_text()) for path in paths}
+    faults = [{'file': file, **fault} for file, tree in trees.items() for fault in edits(tree)]
+    n_of_kind = Counter()
     random.Random(46).shuffle(faults)
 
     def rank(fault):
@@ -111,15 +105,6 @@ def draw(room, name):
 
     by_line = {(one['file'], one['first']): one for one in sorted(faults, key=rank, reverse=True)}
     return [*reversed(by_line.values())][: NUMBERS[room]]
-
-
-def find(fault, faults):
-    """The fault as it is today: in its function, or where its room has it once; None if gone."""
-    for keys in (('file', *SAME), SAME):
-        found = [one for one in faults if all(one[key] == fault[key] for key in keys)]
-        if found and (len(found) == 1 or 'file' in keys):
-            return found[0]
-    return None
 
 
 def tests_of(fault):
@@ -160,19 +145,15 @@ def run(fault, tests, folder):
 
 def main(results, room, name='*.py'):
     """Run the faults of a room that have no result yet."""
-    results, draft = Path(results), Path(results).with_suffix('.draft')
-    if not draft.exists():
-        draft.write_text(json.dumps(draw(room, name), indent=1))
+    results = Path(results)
     done = {json.loads(line)['fault'] for line in results.open()} if results.exists() else set()
     folder = results.with_suffix(f'.{room}').absolute()
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(TREE, folder, ignore=shutil.ignore_patterns('.*'))
     with results.open('a') as file:
-        for k, fault in enumerate(json.loads(draft.read_text())):
+        for k, fault in enumerate(draw(room, name)):
             if k not in done:
-                now = find(fault, faults_of(room))
-                caught = run(now, tests_of(now), folder) if now else 'gone'
-                record = {'fault': k, 'caught': caught, **(now or fault)}
+                record = {'fault': k, 'caught': run(fault, tests_of(fault), folder), **fault}
                 print(json.dumps(record), file=file, flush=True)
 
 

@@ -13,7 +13,6 @@ from functools import partial
 
 import pytest
 from cli_runner import INTERRUPTED, children, is_running, run, start, wait_for
-from conftest import run_python
 from evaluation_samples import label_files, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
@@ -265,12 +264,3 @@ def test_a_worker_of_another_version_is_refused():
     assert cluster._compute_block(__version__, _log, [1])[0] == 1
     with pytest.raises(DataError, match=r'gp_ground_seg .*, not 9\.9'):
         cluster._compute_block('9.9', _log, [1])
-
-
-def test_one_process_needs_no_dask(root, tmp_path):
-    code = (
-        'import sys; from gp_ground_seg.cli.main import main; main(sys.argv[1:]); '
-        'assert not {"dask", "distributed"} & set(sys.modules)'
-    )
-    words = ['--set', 'runtime.backend=numpy', '-o', tmp_path / 'out']
-    run_python(code, 'segment', root / 'sequences/00/velodyne/000000.bin', *words)
