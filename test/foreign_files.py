@@ -135,10 +135,8 @@ def four(size='4', count='1', **lines):
 
 
 CASES |= {
-    'plain.pcd': (pcd(), 'x y z'),
     'one_point.pcd': (pcd(body=text_of(XYZ[:1]), WIDTH='1', POINTS='1'), 'x y z'),
     'no_point.pcd': (pcd(body=b'', WIDTH='0', POINTS='0'), 'no points in it'),
-    'binary.pcd': (pcd(data='binary', body=RAW), 'x y z'),
     'columns.pcd': (pcd(data='BINARY', body=RAW).replace(b'FIELDS', b'COLUMNS'), 'x y z'),
     'no_width.pcd': (pcd(WIDTH=None, HEIGHT=None), 'x y z'),
     'no_points.pcd': (pcd(POINTS=None), 'x y z'),
@@ -215,9 +213,6 @@ def listed(order='<'):
 
 LISTED_TEXT = text_of([*row, k, *range(k), 1, 7] for k, row in enumerate(XYZ))
 CASES |= {
-    'plain.ply': (ply(), 'x y z'),
-    'little.ply': (ply(form=LE, body=RAW), 'x y z'),
-    'big.ply': (ply(form=BE, body=XYZ.astype('>f4').tobytes()), 'x y z'),
     'list_last.ply': (ply(LISTS, listed(), LE), 'x y z'),
     'list_last_big.ply': (ply(LISTS, listed('>'), BE), 'x y z'),
     'list_last_text.ply': (ply(LISTS, LISTED_TEXT), 'x y z'),

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from bag_samples import read_messages
 from cli_runner import error_line, run, start, wait_for
+from conftest import simulated
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.cli.segment import _pose_summary
 from gp_ground_seg.core.errors import in_thousands
-from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.data.bags import decode_cloud, encode_cloud, storage_of
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
-from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
+from gp_ground_seg.lab.simulation import HDL_64E
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -176,19 +176,11 @@ def test_scans_give_label_files(segmenter, tmp_path, capsys, monkeypatch, scans,
 
 # Height and tilt of the sensor.
 
-SMALL = dataclasses.replace(HDL_64E, n_columns=500)
-
-
-def write_scan(path, height, roll=0.0, pitch=0.0, turn=(0.0, 0.0)):
-    mounted = dataclasses.replace(SMALL, height=height, roll=roll, pitch=pitch)
-    points = simulate_scan(SCENES['flat'](1), mounted, np.random.default_rng(1)).points.copy()
-    points[:, :3] = points[:, :3] @ rotation(*turn)
-    path.write_bytes(points.astype('<f4').tobytes())
-
 
 def test_the_summary_has_height_and_tilt_of_the_sensor_and_what_they_contradict(tmp_path, capsys):
     tilt = math.radians(5.0), math.radians(-4.0)
-    write_scan(tmp_path / 'a.bin', 1.2, *tilt)
+    mounted = dataclasses.replace(HDL_64E, n_columns=500, height=1.2, roll=tilt[0], pitch=tilt[1])
+    simulated('flat', mounted, 1).points.tofile(tmp_path / 'a.bin')
     words = ['-o', tmp_path / 'a.label', '--set', 'sensor.height=2.5']
     assert segment(tmp_path / 'a.bin', *words) == 0
     _, line, contradiction = capsys.readouterr().out.splitlines()

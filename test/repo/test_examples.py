@@ -73,13 +73,11 @@ def test_a_subscriber_hears_the_nearest_obstacle(tmp_path):
 
 
 def test_parameters_by_whatever_names_them(tmp_path):
-    given = {'sensor.height': 1.73, 'grid.n_segments': 90}
     path = tmp_path / 'mine.yaml'
-    path.write_text('sensor: {height: 1.73}\ngrid: {n_segments: 90}\n')
-    expected = Config().replace(**given)
-    for named in (expected, given, path, str(path)):
-        assert GroundSegmenter(named).config == expected
-    assert GroundSegmenter(sensor_height=1.73, grid_n_segments=90).config == expected
+    path.write_text('sensor: {height: 1.73}\n')
+    expected = Config().replace(**{'sensor.height': 1.73})
+    for words, values in (((expected,), {}), ((str(path),), {}), ((), {'sensor_height': 1.73})):
+        assert GroundSegmenter(*words, **values).config == expected
     mixed = GroundSegmenter('paper', sensor_height=2.0).config
     assert mixed == Config.preset('paper').replace(**{'sensor.height': 2.0})
     for words, values, says in (
