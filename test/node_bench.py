@@ -60,9 +60,7 @@ class Probe:
     def _take(self, topic, raw, info):
         back = self._back.setdefault(stamp_of(decode_cloud(raw)), {})
         back[topic] = info.get('received_timestamp') or time.time_ns()
-
-    def _n_back(self):
-        return sum(len(self._back.get(stamp, ())) == len(OUTPUTS) for stamp in self._sent)
+        self._last_news = time.monotonic()
 
     def send(self, clouds, rate, on_sent):
         """Send clouds at a rate [Hz]; return counts, and percentiles of the latency."""
@@ -76,14 +74,9 @@ class Probe:
             self._publisher.publish(raw)
             on_sent()
             due += 1.0 / rate
-        n_back, last_news = self._n_back(), time.monotonic()
-        while n_back < len(self._sent) and time.monotonic() < last_news + SILENCE:
+        self._last_news = time.monotonic()
+        while time.monotonic() < self._last_news + SILENCE:
             self._session.spin(0.02)
-            if (n := self._n_back()) > n_back:
-                n_back, last_news = n, time.monotonic()
-        return self._result(rate)
-
-    def _result(self, asked):
         latency = [
             1e-6 * (max(back.values()) - sent)
             for stamp, sent in self._sent.items()
@@ -91,11 +84,11 @@ class Probe:
         ]
         first, *_, last = self._sent.values()
         n_sent = len(self._sent)
-        sent_at = 1e9 * (n_sent - 1) / (last - first)
-        row = {'rate [Hz]': asked, 'sent [Hz]': sent_at, 'sent': n_sent, 'back': len(latency)}
         percents = np.percentile(latency or [np.nan], [*PERCENTILES])
         return {
-            **row,
+            'rate [Hz]': rate,
+            'sent [Hz]': 1e9 * (n_sent - 1) / (last - first),
+            'sent': n_sent,
             'lost': n_sent - len(latency),
             **dict(zip(PERCENTILES.values(), percents, strict=True)),
         }

@@ -41,7 +41,6 @@ FILES = {
     'six.bin': np.hstack([XYZ, XYZ % 1]).astype('f4').tobytes(), 'cut.bin': bytes(17),
     'scan.txt': b'1 2 3', 'notes.md': b'mine', 'none/a.las': b'', 'taken.pcd': b'mine',
     'old.png': b'mine', 'mine/000000.label': b'mine', 'a.label': b'',
-    'typo.yaml': b'label: {ground_tolerence: 0.1}',
     'packed.pcd': pcd(data='binary_compressed', body=struct.pack('<II', 9, 48) + bytes(9)),
 }  # fmt: skip
 MISTAKES = {
@@ -77,7 +76,6 @@ MISTAKES = {
     'segment A --set sensor.hight=1': "unknown .* 'sensor.hight'; did you mean sensor.height",
     'segment A --preset papr': r"unknown preset 'papr'; did you mean paper. \(there are default",
     'segment A --config no.yaml': 'no.yaml: No such file or directory',
-    'segment A --config typo.yaml': 'typo.yaml: unknown .*; did you mean label.ground_tolerance',
     'segment A --workers x': "--workers: 'x': must be a whole number, at least 1; see ",
     'config dmp': "WHAT: invalid choice: 'dmp' .choose from .dump., .check..; see gp-ground-seg c",
     'plot scan scan.npy': 'the following arguments are required: -o/--output; see gp-ground-seg p',

@@ -1,5 +1,6 @@
 """SemanticKITTI folders: what is read, and what is refused."""
 
+import numpy as np
 import pytest
 from evaluation_samples import street, write_frame, write_streets
 
@@ -22,7 +23,14 @@ def test_sequences_and_frames_are_sorted_and_need_scans(tmp_path):
     assert [frame.index for frame in frames] == ['000001', '000002', '000010']
     assert [frame.labels_path is not None for frame in frames] == [True, False, True]
     assert all(frame.sequence == '00' for frame in frames)
-    assert frames[0].points_path.read_bytes() == points.tobytes()
+    assert frames[0].points.tobytes() == points.tobytes()
+    frame, *_, other = semantic_kitti.frames(tmp_path)
+    assert (frame, [other]) == (frames[0], semantic_kitti.frames(tmp_path, '10'))
+    assert str(other) == '10/000000'
+    np.testing.assert_array_equal(frame.is_ground, semantic == 40)
+    np.testing.assert_array_equal(frame.is_scored, ~np.isin(semantic, [0, 1, 70]))
+    with pytest.raises(DataError, match=r'000002\.bin: has no labels'):
+        _ = frames[1].is_ground
     (tmp_path / 'sequences/08/velodyne/000000.bin').unlink()
     with pytest.raises(DataError, match=r'no velodyne/\*\.bin in it'):
         list_frames(tmp_path, '08')

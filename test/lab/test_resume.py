@@ -26,34 +26,26 @@ def times(folder):
     return {path: path.stat().st_mtime_ns for path in folder.rglob('*')}
 
 
-@pytest.mark.parametrize(
-    ('more', 'version', 'before', 'now'),
-    [
-        ('--set label.ground_tolerance=0.2', '', 'ground_tolerance: 0.1', 'ground_tolerance: 0.2'),
-        ('--columns 4', '', 'segment VERSION, from ROOT', 'segment VERSION, from ROOT, columns 4'),
-        ('', '9.9', 'segment VERSION, from ROOT', 'segment 9.9, from ROOT'),
-        ('OTHER', '', 'segment VERSION, from ROOT', 'segment VERSION, from OTHER'),
-    ],
-)
-def test_other_parameters_are_refused(
-    more, version, before, now, segmented, tmp_path, monkeypatch, capsys
-):
+def test_other_parameters_are_refused(segmented, tmp_path, monkeypatch, capsys):
     """The line says what differs, and what to do; the same words again change nothing."""
     (root, out), other = segmented, tmp_path / 'other'
     shutil.copytree(root, other)
-    known = times(out)
+    known, own = times(out), f'segment {__version__}, from {root}'
     assert run('segment', root, '-o', out) == 0
     assert capsys.readouterr().out == '12 of 12 were finished before\n'
-    if version:
+    tolerance = 'ground_tolerance: 0.1', 'ground_tolerance: 0.2'
+    for version, source, words, before, now in (
+        (__version__, root, ['--set', 'label.ground_tolerance=0.2'], *tolerance),
+        (__version__, root, ['--columns', '4'], own, f'{own}, columns 4'),
+        ('9.9', root, [], own, f'segment 9.9, from {root}'),
+        (__version__, other, [], own, f'segment {__version__}, from {other}'),
+    ):
         monkeypatch.setattr(command, '__version__', version)
-    source = other if more == 'OTHER' else root
-    assert run('segment', source, '-o', out, *more.replace('OTHER', '').split()) == 2
-    said = error_line(capsys)
-    for name, value in (('VERSION', __version__), ('ROOT', root), ('OTHER', other)):
-        before, now = before.replace(name, str(value)), now.replace(name, str(value))
-    assert times(out) == known
-    assert said.startswith(f'{out / PARAMETERS}: says "') and before in said and now in said
-    assert said.endswith('; give another output folder, or --force to start anew')
+        assert run('segment', source, '-o', out, *words) == 2
+        said = error_line(capsys)
+        assert times(out) == known
+        assert said.startswith(f'{out / PARAMETERS}: says "') and before in said and now in said
+        assert said.endswith('; give another output folder, or --force to start anew')
 
 
 def test_what_is_missing_or_older_than_its_input_is_done_again(segmented, tmp_path, capsys):

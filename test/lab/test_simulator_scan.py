@@ -282,18 +282,6 @@ def test_returns_of_a_vehicle_on_a_slope_lie_on_it(name):
     assert above.max() > 0.95 * max(z for _, corners in model.bodies for _, z in corners)
 
 
-def test_numbers_and_heights_of_objects():
-    """A vehicle of several solids is one object, of the height of its highest above the ground."""
-    hill = slope(0.1)
-    low = objects.parts_of(0.0, 20.0, [objects.standing_box(hill, 0.0, 20.0, (1.0, 1.0, 0.3))])
-    crate = objects.standing_box(hill, 5.0, 0.0, (1.0, 1.0, 9.0))
-    solids = (*objects.car(hill, 10.0, 0.0), crate, *objects.truck(hill, 20.0, 0.0), *low)
-    assert objects.number_objects(solids).tolist() == [1, 1, 0, 2, 2, 3]
-    none, car, truck, box = objects.object_heights(hill, solids)
-    assert (car, truck, box) == pytest.approx((1.5, 3.6, 0.3)) and math.isnan(none)
-    assert len(objects.object_heights(hill, ())) == 1
-
-
 MEASURES = {
     # Solids, objects, heights of the lowest and of the highest object [m], slopes of half of the
     # ground and of the steepest [degrees].

@@ -9,8 +9,7 @@ import pytest
 from conftest import REPOSITORY, hilly_scan, load_script
 from evaluation_samples import write_streets
 
-from gp_ground_seg import Config, ConfigError, GroundSegmenter, semantic_kitti
-from gp_ground_seg.core.errors import DataError
+from gp_ground_seg import Config, ConfigError, GroundSegmenter
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -88,16 +87,3 @@ def test_parameters_by_whatever_names_them(tmp_path):
     ):
         with pytest.raises(ConfigError, match=re.escape(says)):
             GroundSegmenter(*words, **values)
-
-
-def test_frames_have_points_and_labels(tmp_path):
-    root = write_streets(tmp_path, s00=1, s08=1)
-    frame, other = semantic_kitti.frames(root)
-    assert semantic_kitti.frames(root, '08') == [other] and str(other) == '08/000000'
-    assert frame.points.shape[1] == 4 and frame.points.dtype == np.float32
-    assert frame.is_ground.sum() == np.isin(frame.semantic, [40, 44, 48, 49, 60, 72]).sum() > 0
-    np.testing.assert_array_equal(frame.is_scored, ~np.isin(frame.semantic, [0, 1, 70]))
-    frame.labels_path.unlink()
-    (bare, *_) = semantic_kitti.frames(root)
-    with pytest.raises(DataError, match='has no labels'):
-        _ = bare.is_ground
