@@ -24,6 +24,14 @@ SCALE = float(os.environ.get('TORTURE_SCALE', '1'))
 SPECIAL = [np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-40, -1e-40, 1e-7, 1e7, 3e38, -3e38, 1e300]
 
 
+LAYOUTS = (
+    np.asfortranarray,
+    lambda xyz: np.column_stack([xyz, xyz])[:, :4],
+    lambda xyz: np.repeat(xyz, 2, axis=0)[::2],
+    lambda xyz: xyz[::-1],
+)
+
+
 def random_cloud(rng):
     """Cloud of a random kind, size, type and layout."""
     n = int(
@@ -54,16 +62,7 @@ def random_cloud(rng):
     dtype = rng.choice(['float32', 'float64', 'float16', '>f4'])
     with np.errstate(over='ignore', invalid='ignore'):
         xyz = xyz.astype(dtype)
-    layout = rng.integers(4)
-    if layout == 0:
-        xyz = np.asfortranarray(xyz)
-    elif layout == 1:
-        xyz = np.column_stack([xyz, xyz])[:, :4]
-    elif layout == 2:
-        xyz = np.repeat(xyz, 2, axis=0)[::2]
-    elif layout == 3:
-        xyz = xyz[::-1]
-    return xyz
+    return LAYOUTS[rng.integers(4)](xyz)
 
 
 def random_config(rng):

@@ -20,7 +20,7 @@ def root(tmp_path_factory):
 
 CASES = {
     'ablation ROOT --frame-step 3': ({'models': 8, 'pairs': 8}, 8 * 2),
-    'steps ROOT --frame-step 3': ({'steps': 9}, 9 * 2),
+    'steps ROOT --sequences 08': ({'steps': 9}, 9),
     'pseudo-inputs ROOT --frame-step 3': ({'pseudo_inputs': 7}, 7 * 2),
     'scenes --scenes low_boxes,bank,ramp --sensors vlp-16 --seeds 1':
         ({'scenes': 3, 'low': 1, 'rough': 3}, 2 * 3),

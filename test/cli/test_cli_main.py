@@ -40,7 +40,7 @@ FILES = {
     'root/sequences/00/velodyne/000000.bin': ONE, 'root/sequences/08/velodyne/000000.bin': ONE,
     'six.bin': np.hstack([XYZ, XYZ % 1]).astype('f4').tobytes(), 'cut.bin': bytes(17),
     'scan.txt': b'1 2 3', 'notes.md': b'mine', 'none/a.las': b'', 'taken.pcd': b'mine',
-    'old.png': b'mine', 'mine/000000.label': b'mine', 'a.label': b'',
+    'old.png': b'mine', 'mine/000000.label': b'mine', 'a.label': b'', 'a#2?.db3': b'',
     'packed.pcd': pcd(data='binary_compressed', body=struct.pack('<II', 9, 48) + bytes(9)),
 }  # fmt: skip
 MISTAKES = {
@@ -70,6 +70,8 @@ MISTAKES = {
     'segment root -o x.ply': 'x.ply: must be a folder',
     'segment drive.mcap --workers 2': '--workers: is for scans, not for a bag',
     'segment drive.mcap -o x.bag': '.*only ROS 2 bags are written',
+    'segment drive.mcap -o 100%.db3': '.*sqlite3 bag cannot have % in its path',
+    'segment a#2?.db3': r'.*sqlite3 bag cannot have # \? in its path',
     'segment drive.mcap -o no/such/x': '.*no/such does not exist',
     'segment drive.mcap -o . --force': '.*is the input, or has it in it',
     'segment A --set a': '--set a: must be NAME=VALUE',

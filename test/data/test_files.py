@@ -94,8 +94,7 @@ WORDS = [
     b'DATA binary_compressed\n', b'property list uchar int a\n', b'property double x\n',
     b'element vertex 0\n', b'format ascii 1.0\n', b'nan', b'-inf', b'1e999', b'1_0',
     b"'descr': [('x', '<f4', (2,))]", b"('x', 'O')", b"'shape': (99999999999,)", b'-1', b' ',
-    b'*a', b'&a [*a, *a]', b'.nan', b'0x7f', b'!!python/name:os', b'~', b'[1, 2]', b'{a: b}',
-    b'?\n', b'"\\ud800"', b'\ngrid:\n', b'1' * 300, b'\t', b'0x10', b'\r', b'\0',
+    b'?\n', b'1' * 300, b'\t', b'0x10', b'\r', b'\0',
     b'999999999999999999999', b'\xc3\xa9', b'\xff' * 4, b'\0\0\0\x80',
 ]  # fmt: skip
 N_DAMAGED = round(60 + 2000 * float(os.environ.get('TORTURE_SCALE', '0')))
