@@ -48,11 +48,6 @@ def cloud(index=0, **changes):
     )
 
 
-def string_message(text):
-    message = jazzy_types().types['std_msgs/msg/String'](text)
-    return bytes(jazzy_types().serialize_cdr(message, 'std_msgs/msg/String'))
-
-
 def write_ros2_bag(path, n_clouds=3, topics=('/points',), silent=(), **changes):
     """Clouds on each topic, a string before every one of them; returns what was written."""
     written = []
@@ -60,7 +55,9 @@ def write_ros2_bag(path, n_clouds=3, topics=('/points',), silent=(), **changes):
     with new_bag(path, kinds) as write:
         for k in range(n_clouds):
             time = START + k * PERIOD
-            entries = [('/note', time - 7, string_message(f'cloud {k}'))]
+            note = jazzy_types().types['std_msgs/msg/String'](f'cloud {k}')
+            raw = bytes(jazzy_types().serialize_cdr(note, 'std_msgs/msg/String'))
+            entries = [('/note', time - 7, raw)]
             entries += [(topic, time, encode_cloud(cloud(k, **changes))) for topic in topics]
             for entry in entries:
                 write(*entry)

@@ -14,7 +14,6 @@ from gp_ground_seg.data.cloud_files import WRITABLE, read_file
 from gp_ground_seg.data.inputs import list_inputs
 
 POINTS = scan()
-NAMES = ('x', 'y', 'z', 'intensity')
 
 
 @pytest.fixture(scope='module')
@@ -37,7 +36,7 @@ def test_every_format_holds_the_results_of_each_point_and_is_segmented(source, s
     assert run('segment', source, '-o', out) == 0
     found = read_file(out).fields
     np.testing.assert_array_equal(found['label'], expected.label)
-    for k, name in enumerate(NAMES):
+    for k, name in enumerate([*'xyz', 'intensity']):
         np.testing.assert_array_equal(found[name], POINTS[:, k])
     for name in ('height', 'ground_z', 'ground_std', 'p_ground'):
         assert found[name].dtype == np.float32

@@ -164,9 +164,6 @@ def test_space_follows_the_configuration(changes, n_free):
     assert space.centre[5] == 0.0
 
 
-N_POINTS = fewer(4000, 400)
-
-
 def test_what_is_learned_does_not_choose_inliers():
     scan = hilly_scan(30_000)
     learned, given = (
@@ -197,7 +194,7 @@ def test_every_nth_segment_by_itself_has_the_inliers_it_has_in_the_frame():
 def test_the_preset_paper_learns_until_no_more_join():
     """Nine classes of lines share their length-scales, which stay between their limits."""
     config = PRESETS['paper'].config
-    result = GroundSegmenter(config, backend=MODEL).segment(hilly_scan(4 * N_POINTS))
+    result = GroundSegmenter(config, backend=MODEL).segment(hilly_scan(fewer(16_000, 1600)))
     assert result.fit.status == 'converged'
     assert 20 < result.fit.n_evaluations < config.learning.max_evaluations
     assert len(result.fit.theta) == 14

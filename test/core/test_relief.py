@@ -39,12 +39,6 @@ def candidates_on(height, ranges, n_segments=180, seed=0, share=1.0, spread=0.3)
 RINGS = np.concatenate([np.arange(3.0, 20.0, 0.5), np.arange(20.0, 40.0, 1.0)])
 
 
-def heights_of(relief):
-    """Heights in the middle of the squares, by x and y."""
-    x, y = np.meshgrid(MIDDLES, MIDDLES, indexing='ij')
-    return relief.at(x.ravel(), y.ravel()).reshape(x.shape)
-
-
 @settings(max_examples=fewer(12, 6), deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from([4, 45, 90]), st.booleans())
 def test_backends_find_one_relief(compiled_code, seed, n_segments, looks_aside):
@@ -186,7 +180,8 @@ def test_without_ground_near_the_sensor_there_is_no_relief(backend):
 def test_between_middles_it_is_linear_and_beyond_the_border_constant():
     height = np.random.default_rng(0).normal(size=(N_SIDES, N_SIDES))
     relief = Relief.of(height)
-    np.testing.assert_allclose(heights_of(relief), height, atol=1e-4)
+    x, y = (at.ravel() for at in np.meshgrid(MIDDLES, MIDDLES, indexing='ij'))
+    np.testing.assert_allclose(relief.at(x, y), height.ravel(), atol=1e-4)
     x, y = MIDDLES[10] + 0.5, MIDDLES[20] + 1.5
     expected = np.array([0.75, 0.25]) @ height[10:12, 20:22] @ np.array([0.25, 0.75])
     found = relief.at(np.array([x, -500.0, 80.0]), np.array([y, MIDDLES[0], 70.0]))

@@ -21,8 +21,6 @@ from gp_ground_seg.lab.scoring.tables import time_tables
 from gp_ground_seg.lab.simulation import Kind, semantic_kitti_labels
 from gp_ground_seg.lab.simulation.objects import object_heights
 
-FIXED = Config().replace(**{'learning.mode': 'fixed'})
-
 
 def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     """The worth of the latent process; docs/experiments.md has the whole table."""
@@ -36,7 +34,7 @@ def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
 
 
 def test_steps_go_from_the_paper_to_the_parameters_given():
-    for config in (Config(), FIXED):
+    for config in (Config(), Config().replace(**{'learning.mode': 'fixed'})):
         steps = [*experiments.paper_steps(config).values()]
         assert (steps[0], steps[-1]) == (PRESETS['paper'].config, config)
         assert all(before != after for before, after in itertools.pairwise(steps))
