@@ -29,14 +29,13 @@ ros__parameters:). Exit code 2 if anything is wrong.
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and its subcommands."""
     description = 'Show the parameters, their units and ranges.'
-    parser = options.new_parser(subparsers, 'config', description, EXAMPLES)
+    parser = options.command(subparsers, 'config', description, EXAMPLES)
     commands = parser.add_subparsers(metavar='WHAT', required=True)
-    parser = options.new_parser(commands, 'dump', DUMP, EXAMPLES, DUMP)
-    options.add_config(parser)
-    parser.set_defaults(run=run_dump)
-    parser = options.new_parser(commands, 'check', CHECK_DESCRIPTION, EXAMPLES, CHECK)
-    parser.add_argument('files', metavar='FILE', nargs='+', help='parameter file (YAML)')
-    parser.set_defaults(run=run_check)
+    options.command(commands, 'dump', DUMP, EXAMPLES, *options.CONFIG, purpose=DUMP, run=run_dump)
+    files = 'files', 'parameter file (YAML)', {'metavar': 'FILE', 'nargs': '+'}
+    options.command(
+        commands, 'check', CHECK_DESCRIPTION, EXAMPLES, files, purpose=CHECK, run=run_check
+    )
 
 
 def run_dump(arguments: argparse.Namespace) -> int:

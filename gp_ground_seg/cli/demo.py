@@ -58,15 +58,13 @@ exit code: 0, 1 if points were lost, 2 for an error, 130 when interrupted
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = options.new_parser(subparsers, 'demo', DESCRIPTION, EXAMPLES)
-    options.add(
-        parser,
+    options.command(
+        subparsers, 'demo', DESCRIPTION, EXAMPLES,
         ('--frames', 'scans to play (default: %(default)s)', {**options.NUMBER, 'default': 30}),
         ('--output', 'folder for what is written (default: %(default)s)',
          {'metavar': 'DIR', 'default': 'demo_output'}),
-        options.FORCE,
+        options.FORCE, run=run,
     )  # fmt: skip
-    parser.set_defaults(run=run)
 
 
 class Tally:

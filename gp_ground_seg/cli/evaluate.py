@@ -80,6 +80,7 @@ OF_FRAMES = (
     ('--frame-step', 'every Nth frame of a sequence only', options.NUMBER),
     options.COLUMNS,
 )
+REPORT = options.MARKDOWN, options.TO_JSON, options.FORCE
 CUT = (
     '--cut',
     f'height [m] at which objects are cut, to count low objects (default: {CUT_HEIGHT}); '
@@ -90,50 +91,44 @@ CUT = (
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
-    parser = options.new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
     peer = 'compare with this method: patchworkpp (pip install pypatchworkpp)'
-    options.add(parser, ROOT, *OF_FRAMES, CUT)
-    options.add(
-        parser.add_mutually_exclusive_group(),
-        ('--against', 'compare with this parameter file or preset', {'metavar': 'NAME'}),
-        ('--peer', peer, {'choices': ['patchworkpp'], 'metavar': 'METHOD'}),
-    )
-    options.add(parser, options.MARKDOWN, options.TO_JSON, options.FORCE)
-    options.add_cluster(parser)
-    options.add_config(parser)
-    parser.set_defaults(run=run_evaluate)
+    options.command(
+        subparsers, 'evaluate', DESCRIPTION, EXAMPLES, ROOT, *OF_FRAMES, CUT,
+        [('--against', 'compare with this parameter file or preset', {'metavar': 'NAME'}),
+         ('--peer', peer, {'choices': ['patchworkpp'], 'metavar': 'METHOD'})],
+        *REPORT, options.CLUSTER, *options.CONFIG, run=run_evaluate,
+    )  # fmt: skip
     _add_experiments(subparsers)
 
 
 def _add_experiments(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare `experiment`, and a command below it for each of `EXPERIMENTS`."""
     description = 'Repeat an experiment of docs/: configurations scored over scans.'
-    parser = options.new_parser(subparsers, 'experiment', description, EXPERIMENT_EXAMPLES)
+    parser = options.command(subparsers, 'experiment', description, EXPERIMENT_EXAMPLES)
     names = parser.add_subparsers(metavar='NAME', required=True, dest='experiment')
     for name, experiment in EXPERIMENTS.items():
         description = inspect.getdoc(experiment.run) or name
         source = ' KITTI_ROOT' if experiment.labelled else ' --sensors vlp-16'
         example = f'  gp-ground-seg experiment {name}{source} --json {name}.json'
-        purpose = description.splitlines()[0].removesuffix('.')
-        child = options.new_parser(names, name, f'{description}\n', example, purpose)
-        child.set_defaults(run=run_experiment, root=None, workers=None, scheduler=None)
+        given: list[Any] = []
         if experiment.labelled:
             count = {'nargs': '?'} if experiment.sensors else {}
-            options.add(child, (*ROOT[:2], {**ROOT[2], **count}), *OF_FRAMES)
+            given += (*ROOT[:2], {**ROOT[2], **count}), *OF_FRAMES
         if experiment.sensors:
             n_seeds = f'scenes of each kind (default: {experiment.n_seeds})'
-            options.add(child, ('--seeds', n_seeds, options.NUMBER))
+            given += [('--seeds', n_seeds, options.NUMBER)]
             for option, known, default in (
                 ('--sensors', SENSORS, experiment.sensors),
                 ('--scenes', SCENES, experiment.scenes),
             ):
                 text = f'some of {", ".join(known)} (default: {", ".join(default)})'
-                kind = {'metavar': 'LIST', 'type': options.some_of(known)}
-                options.add(child, (option, text, kind))
-        options.add(child, options.MARKDOWN, options.TO_JSON, options.FORCE)
-        if not experiment.is_timed:
-            options.add_cluster(child)
-        options.add_config(child)
+                given += [(option, text, {'metavar': 'LIST', 'type': options.some_of(known)})]
+        given += *REPORT, *([] if experiment.is_timed else [options.CLUSTER]), *options.CONFIG
+        options.command(
+            names, name, f'{description}\n', example, *given, run=run_experiment,
+            purpose=description.splitlines()[0].removesuffix('.'),
+            root=None, workers=None, scheduler=None,
+        )  # fmt: skip
 
 
 def run_evaluate(arguments: argparse.Namespace) -> int:

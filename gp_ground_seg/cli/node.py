@@ -29,12 +29,12 @@ WARM_UP_EXAMPLES = """\
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands; what follows ``--ros-args`` is left to ROS or the node."""
     description = 'Run the ROS 2 node: points in, ground and obstacles out.'
-    parser = options.new_parser(subparsers, 'node', description, NODE_EXAMPLES)
+    parser = options.command(
+        subparsers, 'node', description, NODE_EXAMPLES,
+        run=lambda given: run_node(given.ros_args), accepts_ros_args=True,
+    )  # fmt: skip
     parser.usage = 'gp-ground-seg node [--ros-args ...]'
-    parser.set_defaults(run=lambda a: run_node(a.ros_args), accepts_ros_args=True)
-
-    parser = options.new_parser(subparsers, 'warm-up', WARM_UP_DESCRIPTION, WARM_UP_EXAMPLES)
-    parser.set_defaults(run=run_warm_up)
+    options.command(subparsers, 'warm-up', WARM_UP_DESCRIPTION, WARM_UP_EXAMPLES, run=run_warm_up)
 
 
 def main(*, is_managed: bool = False) -> int:

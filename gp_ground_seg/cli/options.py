@@ -27,6 +27,8 @@ COMPILING_PAYS = 300  # scans
 WIDTH = 79  # of the texts of help
 LINE_PERIOD = 30.0  # time between lines of progress where there is no terminal [s]
 BAR = '{desc} |{bar}| {n_fmt} of {total_fmt} frames done, {remaining} left'
+Option = tuple[str, str, dict[str, Any]]
+"""Names of an option, its help, and what else `add_argument` takes."""
 FLAG = {'action': 'store_true'}
 FORCE = ('--force', 'replace existing output', FLAG)
 MARKDOWN = ('--markdown', 'print the tables as Markdown', FLAG)
@@ -34,28 +36,33 @@ QUIET = ('--quiet', 'no progress bar, no notes', FLAG)
 TO_JSON = ('--json', 'write every number to this file as well', {'metavar': 'FILE'})
 
 
-def new_parser(
+def command(
     subparsers: argparse._SubParsersAction[argparse.ArgumentParser],
     name: str,
     description: str,
     examples: str,
+    *options: Option | list[Option],
     purpose: str = '',
+    **defaults: Any,
 ) -> argparse.ArgumentParser:
-    """Return the parser of a command; paragraphs are filled, examples keep their line breaks."""
+    """Declare a command; paragraphs are filled, examples keep their line breaks.
+
+    Of options in a list only one may be given. `defaults` are values of the parsed arguments.
+    """
     paragraphs = (textwrap.fill(part, WIDTH) for part in description.split('\n\n'))
-    return subparsers.add_parser(
+    parser = subparsers.add_parser(
         name,
         help=purpose,
         description='\n\n'.join(paragraphs),
         epilog=f'examples:\n{examples}',
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-
-
-def add(parser: argparse._ActionsContainer, *options: tuple[str, str, dict[str, Any]]) -> None:
-    """Add options: names, help, and what else `add_argument` takes."""
-    for names, text, more in options:
-        parser.add_argument(*names.split(), help=text, **more)
+    parser.set_defaults(**defaults)
+    for entry in options:
+        group = parser if isinstance(entry, tuple) else parser.add_mutually_exclusive_group()
+        for names, text, more in [entry] if isinstance(entry, tuple) else entry:
+            group.add_argument(*names.split(), help=text, **more)
+    return parser
 
 
 def positive(word: str, least: int = 1) -> int:
@@ -66,16 +73,30 @@ def positive(word: str, least: int = 1) -> int:
 
 
 NUMBER: dict[str, Any] = {'metavar': 'N', 'type': positive}
-COLUMNS: tuple[str, str, dict[str, Any]] = (
+COLUMNS: Option = (
     '--columns', f'numbers per point of a .bin scan, x y z first (default: {KITTI_COLUMNS})',
     {'metavar': 'N', 'type': partial(positive, least=MIN_COLUMNS)},
 )  # fmt: skip
 """Option of every command that reads ``.bin`` scans."""
-CLOUDS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+CLOUDS: tuple[Option, ...] = (
     ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
     COLUMNS,
 )
 """Options of every command that reads clouds of any format."""
+CLUSTER: list[Option] = [
+    ('--workers', 'compute in N processes of this machine', NUMBER),
+    ('--scheduler', 'compute on the Dask cluster of this scheduler, as in tcp://HOST:8786',
+     {'metavar': 'ADDRESS'}),
+]  # fmt: skip
+"""Options of `runner`."""
+CONFIG: tuple[Option, ...] = (
+    ('--preset', f'set of parameters: {", ".join(PRESETS)} (default: {DEFAULT_PRESET})',
+     {'metavar': 'NAME', 'default': DEFAULT_PRESET}),
+    ('--config', 'parameter file (YAML), over the preset', {'metavar': 'FILE'}),
+    ('--set', 'one parameter, as in --set label.ground_tolerance=0.15 (may be repeated)',
+     {'metavar': 'NAME=VALUE', 'action': 'append', 'default': [], 'dest': 'settings'}),
+)  # fmt: skip
+"""Options of `read_config`."""
 
 
 def list_clouds(arguments: argparse.Namespace, source: Path | None = None) -> Inputs:
@@ -101,18 +122,8 @@ def refuse(arguments: argparse.Namespace, names: Iterable[str], reason: str) -> 
             raise DataError(f'--{name.replace("_", "-")}: {reason}')
 
 
-def add_cluster(parser: argparse.ArgumentParser) -> None:
-    """Add ``--workers N`` and ``--scheduler ADDRESS``."""
-    add(
-        parser.add_mutually_exclusive_group(),
-        ('--workers', 'compute in N processes of this machine', NUMBER),
-        ('--scheduler', 'compute on the Dask cluster of this scheduler, as in tcp://HOST:8786',
-         {'metavar': 'ADDRESS'}),
-    )  # fmt: skip
-
-
 def runner(arguments: argparse.Namespace, title: str) -> AbstractContextManager[Runner]:
-    """Return a runner of blocks of frames by the options of `add_cluster`, with a bar."""
+    """Return a runner of blocks of frames by the options `CLUSTER`, with a bar."""
     bar = progress(title, quiet=getattr(arguments, 'quiet', False))
     return open_runner(arguments.workers, arguments.scheduler, bar)
 
@@ -138,19 +149,6 @@ def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:
         return words
 
     return parse
-
-
-def add_config(parser: argparse.ArgumentParser) -> None:
-    """Add ``--preset NAME``, ``--config FILE`` and ``--set NAME=VALUE``."""
-    presets = f'set of parameters: {", ".join(PRESETS)} (default: {DEFAULT_PRESET})'
-    setting = 'one parameter, as in --set label.ground_tolerance=0.15 (may be repeated)'
-    repeated = {'action': 'append', 'default': [], 'dest': 'settings'}
-    add(
-        parser,
-        ('--preset', presets, {'metavar': 'NAME', 'default': DEFAULT_PRESET}),
-        ('--config', 'parameter file (YAML), over the preset', {'metavar': 'FILE'}),
-        ('--set', setting, {'metavar': 'NAME=VALUE', **repeated}),
-    )
 
 
 def read_config(arguments: argparse.Namespace) -> Config:

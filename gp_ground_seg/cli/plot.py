@@ -41,34 +41,28 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Declare the command and its pictures."""
     description = 'Draw a segmented scan: in perspective, or one segment of it.'
     examples = SCAN_EXAMPLES + SEGMENT_EXAMPLES
-    parser = options.new_parser(subparsers, 'plot', description, examples)
+    parser = options.command(subparsers, 'plot', description, examples)
     pictures = parser.add_subparsers(metavar='PICTURE', required=True, dest='picture')
-    scan = options.new_parser(pictures, 'scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective')
-    scan.add_argument(
-        '--camera', metavar='AZIMUTH,ELEVATION,DISTANCE', type=camera,
-        help='where it stands, seen from the middle of the scene: counter-clockwise from ahead '
-        'within 360 deg, upwards within 89 deg, 1 to 1000 m away (default: 196,24 and as near '
-        'as the cloud is small)',
+    of_both: tuple[options.Option, ...] = (
+        ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
+        ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'}),
+        ('--frame', 'which of several, from 0 (default: 0)', {'metavar': 'N', 'type': int}),
+        ('-o --output', f'{ENDINGS} file', {'metavar': 'OUT', 'required': True}),
+        *options.CLOUDS, options.FORCE, *options.CONFIG,
     )  # fmt: skip
-    segment = options.new_parser(
-        pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, 'a segment from the side'
-    )
-    segment.add_argument(
-        '--segment', metavar='N[,N]', type=numbers, required=True,
-        help='number of the segment, or of several side by side',
+    options.command(
+        pictures, 'scan', SCAN, SCAN_EXAMPLES,
+        ('--camera', 'where it stands, seen from the middle of the scene: counter-clockwise from '
+         'ahead within 360 deg, upwards within 89 deg, 1 to 1000 m away (default: 196,24 and as '
+         'near as the cloud is small)', {'metavar': 'AZIMUTH,ELEVATION,DISTANCE', 'type': camera}),
+        *of_both, purpose='a scan in perspective', run=run,
     )  # fmt: skip
-    for picture in (scan, segment):
-        options.add(
-            picture,
-            ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
-            ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'}),
-            ('--frame', 'which of several, from 0 (default: 0)', {'metavar': 'N', 'type': int}),
-            ('-o --output', f'{ENDINGS} file', {'metavar': 'OUT', 'required': True}),
-            *options.CLOUDS,
-            options.FORCE,
-        )  # fmt: skip
-        options.add_config(picture)
-        picture.set_defaults(run=run)
+    options.command(
+        pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES,
+        ('--segment', 'number of the segment, or of several side by side',
+         {'metavar': 'N[,N]', 'type': numbers, 'required': True}),
+        *of_both, purpose='a segment from the side', run=run,
+    )  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

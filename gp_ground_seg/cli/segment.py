@@ -58,10 +58,8 @@ EXAMPLES = """\
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
-    parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
-    parser.usage = '%(prog)s INPUT [-o OUT] [options]'
-    options.add(
-        parser,
+    parser = options.command(
+        subparsers, 'segment', DESCRIPTION, EXAMPLES,
         ('input', 'scan, folder of scans, bag, or a root', {'metavar': 'INPUT'}),
         ('more', argparse.SUPPRESS, {'nargs': '*', 'default': []}),
         ('-o --output', 'for scans a folder, or a file for a single scan; for a bag a folder, '
@@ -70,13 +68,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--format', 'of a file for each scan or cloud (default: by the name of OUT, else labels '
          f'of .bin scans, and as the input): {", ".join(FORMATS)}',
          {'choices': FORMATS, 'metavar': 'FORMAT'}),
-        *options.CLOUDS,
-        options.FORCE,
-        options.QUIET,
+        *options.CLOUDS, options.FORCE, options.QUIET, options.CLUSTER, *options.CONFIG, run=run,
     )  # fmt: skip
-    options.add_cluster(parser)
-    options.add_config(parser)
-    parser.set_defaults(run=run)
+    parser.usage = '%(prog)s INPUT [-o OUT] [options]'
 
 
 def run(arguments: argparse.Namespace) -> int:

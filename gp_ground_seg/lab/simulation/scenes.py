@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -67,8 +68,13 @@ class Scene:
     leans: bool = False  # whether the vehicle leans with the ground under it, or is level
 
 
-def _scattered(terrain: Terrain, rng: np.random.Generator) -> tuple[Solid, ...]:
-    """Cars, trucks, crates, walls, poles and trees on both sides of the drive."""
+Made = tuple[Any, ...]
+"""Fields of a `Scene` behind its name; those at the end may be left out."""
+
+
+def _open(make: Callable[[np.random.Generator], Terrain], rng: np.random.Generator) -> Made:
+    """Terrain with cars, crates, walls, poles and trees on both sides of the drive."""
+    terrain = make(rng)
     solids: list[Solid] = []
     for k in range(N_SCATTERED):
         x = rng.uniform(*SCATTER_X)
@@ -88,7 +94,7 @@ def _scattered(terrain: Terrain, rng: np.random.Generator) -> tuple[Solid, ...]:
             case _:
                 along = rng.uniform(4.0, 12.0)
                 solids += objects.wall(terrain, (x, y), (x + along, y), rng.uniform(1.0, 2.5))
-    return tuple(solids)
+    return terrain, solids
 
 
 _OPEN_COUNTRY: dict[str, Callable[[np.random.Generator], Terrain]] = {
@@ -111,15 +117,8 @@ _OPEN_COUNTRY: dict[str, Callable[[np.random.Generator], Terrain]] = {
 }
 
 
-def _open_scene(name: str, seed: int) -> Scene:
-    rng = np.random.default_rng(seed)
-    terrain = _OPEN_COUNTRY[name](rng)
-    return Scene(name, terrain, _scattered(terrain, rng))
-
-
-def _urban(seed: int) -> Scene:
+def _urban(rng: np.random.Generator) -> Made:
     """Street: kerbs, parked cars, a truck, houses, awnings, poles, trees, a bridge, puddles."""
-    rng = np.random.default_rng(seed)
     road, front = 6.0, 10.0
     terrain = kerb(road, 0.15)
     solids: list[Solid] = []
@@ -145,7 +144,7 @@ def _urban(seed: int) -> Scene:
     for x in np.arange(URBAN_X[0], URBAN_X[1], 30.0) + rng.uniform(0.0, 20.0):
         solids.append(objects.floating_box(terrain, x, front - 1.0, (6.0, 2.0, 0.2), 2.1))
     solids.append(objects.standing_box(terrain, rng.uniform(10.0, 20.0), -8.0, (0.5, 0.5, 0.4)))
-    return Scene('urban', terrain, tuple(solids), tuple(wet))
+    return terrain, solids, wet
 
 
 @dataclass(frozen=True)
@@ -191,9 +190,8 @@ class _Line:
         return solids, free
 
 
-def _traffic_jam(seed: int) -> Scene:
+def _traffic_jam(rng: np.random.Generator) -> Made:
     """Five lanes of waiting vehicles between kerbs, cyclists between them, persons who cross."""
-    rng = np.random.default_rng(seed)
     terrain = kerb(8.2, 0.15)
     solids: list[Solid] = []
     with_truck = rng.choice([-1, 1])
@@ -218,12 +216,11 @@ def _traffic_jam(seed: int) -> Scene:
         solids += objects.wall(terrain, (-60.0, side * 13.0), (70.0, side * 13.0), 7.0)
         for x in np.arange(-25.0, 25.0, 10.0) + rng.uniform(0.0, 8.0):
             solids += traffic.person(terrain, x, side * rng.uniform(9.0, 12.0))
-    return Scene('traffic_jam', terrain, tuple(solids))
+    return terrain, solids
 
 
-def _car_park(seed: int) -> Scene:
+def _car_park(rng: np.random.Generator) -> Made:
     """Rows of parked cars, 0.6 to 1 m apart, along aisles 6 m wide with persons in them."""
-    rng = np.random.default_rng(seed)
     terrain = slope(rng.uniform(0.0, 0.02), rng.uniform(-math.pi, math.pi))
     solids: list[Solid] = []
     for aside, side in itertools.product((5.5, 10.6, 21.5, 26.6), (-1.0, 1.0)):
@@ -233,12 +230,11 @@ def _car_park(seed: int) -> Scene:
     for x in (-12.0, -7.5, 3.0, 7.5, 12.0, 16.5, 21.0, 25.5):
         place = x + rng.uniform(0.0, 3.0), rng.uniform(-2.6, 2.6)
         solids += traffic.person(terrain, *place)
-    return Scene('car_park', terrain, tuple(solids))
+    return terrain, solids
 
 
-def _hidden_climb(seed: int) -> Scene:
+def _hidden_climb(rng: np.random.Generator) -> Made:
     """Parked cars in a row, and right behind it a street that climbs by 10 to 15 %."""
-    rng = np.random.default_rng(seed)
     heading, near = rng.uniform(-math.pi, math.pi), rng.uniform(4.5, 6.5)
     foot, gradient = near + rng.uniform(1.5, 2.5), rng.uniform(0.1, 0.15)
     terrain = polyline(heading, [(foot, 0.0), (foot + 50.0, 50.0 * gradient)])
@@ -252,28 +248,24 @@ def _hidden_climb(seed: int) -> Scene:
         else:
             name, yaw = str(rng.choice(CARS)), heading + rng.normal(0.0, 0.1)
             solids += traffic.vehicle(terrain, name, *place, yaw)
-    return Scene('hidden_climb', terrain, tuple(solids))
+    return terrain, solids
 
 
-def _wet_road(seed: int) -> Scene:
+def _wet_road(rng: np.random.Generator) -> Made:
     """Traffic jam in the rain: of the near returns of ground a third is missing or mirrored."""
-    dry = _traffic_jam(seed)
-    return Scene('wet_road', dry.terrain, dry.solids, (WetPatch(0.0, 0.0, 20.0, 0.35, True),))
+    return *_traffic_jam(rng), [WetPatch(0.0, 0.0, 20.0, 0.35, True)]
 
 
-def _blind_slope(seed: int) -> Scene:
+def _blind_slope(rng: np.random.Generator) -> Terrain:
     """Slope of 10 to 15 % around a level place 2 to 3 m wide: it begins in the blind spot."""
-    rng = np.random.default_rng(seed)
     gradient, half = rng.uniform(0.1, 0.15), rng.uniform(1.0, 1.5)
     rise = 40.0 * gradient
     corners = [(-half - 40.0, -rise), (-half, 0.0), (half, 0.0), (half + 40.0, rise)]
-    terrain = polyline(rng.uniform(-math.pi, math.pi), corners)
-    return Scene('blind_slope', terrain, _scattered(terrain, rng))
+    return polyline(rng.uniform(-math.pi, math.pi), corners)
 
 
-def _hedge(seed: int) -> Scene:
+def _hedge(rng: np.random.Generator) -> Made:
     """Path between dense hedges 0.5 to 0.8 m high, with a fence behind one of them."""
-    rng = np.random.default_rng(seed)
     terrain = rough(rng, 0.02, (1.5, 10.0))
     solids: list[Solid] = []
     side = rng.choice([-1.0, 1.0])
@@ -291,7 +283,7 @@ def _hedge(seed: int) -> Scene:
             rail = objects.floating_box(terrain, x + 1.0, fence, (2.0, 0.04, 0.12), clearance)
             solids.append(rail)
     solids += traffic.person(terrain, rng.uniform(5.0, 15.0), rng.uniform(-1.0, 1.0))
-    return Scene('hedge', terrain, tuple(solids))
+    return terrain, solids
 
 
 def _around(
@@ -335,18 +327,15 @@ def _around(
     return tuple(solids)
 
 
-def _hills(seed: int) -> Scene:
+def _hills(rng: np.random.Generator) -> Made:
     """Waves of 14 to 45 m, 0.9 m rms, and of 1 to 5 m, 4 cm rms, on which the vehicle leans."""
-    rng = np.random.default_rng(seed)
     smooth = rough(rng, 0.9, (14.0, 45.0))
     terrain = Sum((smooth, rough(rng, 0.04, (1.0, 5.0))))
-    solids = _around(smooth, terrain, rng, (6.0, 32.0))
-    return Scene('hills', terrain, solids, leans=True)
+    return terrain, _around(smooth, terrain, rng, (6.0, 32.0)), (), True
 
 
-def _valley(seed: int) -> Scene:
+def _valley(rng: np.random.Generator) -> Made:
     """Level floor 6 to 10 m wide between sides of 15 to 25 degrees that are 6 m high."""
-    rng = np.random.default_rng(seed)
     floor, gradient = rng.uniform(3.0, 5.0), math.tan(math.radians(rng.uniform(15.0, 25.0)))
     top = floor + 6.0 / gradient
     corners = [(-top, 6.0), (-floor, 0.0), (floor, 0.0), (top, 6.0)]
@@ -355,36 +344,32 @@ def _valley(seed: int) -> Scene:
     terrain = Sum((smooth, rough(rng, 0.03, (1.0, 6.0))))
     along = _Line(terrain, rng, heading - 0.5 * math.pi, 0.0)
     places = [along.at(k, rng.uniform(-0.6, 0.6) * floor) for k in ENDS]
-    return Scene('valley', terrain, _around(smooth, terrain, rng, (6.0, 24.0), places))
+    return terrain, _around(smooth, terrain, rng, (6.0, 24.0), places)
 
 
-def _bank(seed: int) -> Scene:
-    """Bank of 15, 25 or 35 degrees, 2.5 to 4.5 m high, with persons and crates on it."""
-    rng = np.random.default_rng(seed)
-    heading, gradient = rng.uniform(-math.pi, math.pi), math.tan(BANKS[seed % len(BANKS)])
+def _bank(slope: float, rng: np.random.Generator) -> Made:
+    """Bank of a slope [rad], 2.5 to 4.5 m high, with persons and crates on it."""
+    heading, gradient = rng.uniform(-math.pi, math.pi), math.tan(slope)
     foot, rise = rng.uniform(9.0, 14.0), rng.uniform(2.5, 4.5)
     depth = rise / gradient
     smooth = polyline(heading, [(foot, 0.0), (foot + depth, rise)])
     terrain = Sum((smooth, rough(rng, 0.02, (1.0, 8.0))))
     middle = _Line(terrain, rng, heading - 0.5 * math.pi, foot + 0.5 * depth)
     places = [middle.at(k, rng.uniform(-0.25, 0.25) * depth) for k in (-10.0, -3.5, 3.5, 10.0)]
-    return Scene('bank', terrain, _around(smooth, terrain, rng, (6.0, 32.0), places))
+    return terrain, _around(smooth, terrain, rng, (6.0, 32.0), places)
 
 
-def _on_ramp(seed: int) -> Scene:
+def _on_ramp(rng: np.random.Generator) -> Made:
     """Ramp of 15 to 25 %, 9 to 17 m long, between level ground; the vehicle stands on it."""
-    rng = np.random.default_rng(seed)
     gradient, behind, ahead = rng.uniform((0.15, 4.0, 5.0), (0.25, 8.0, 9.0)).tolist()
     corners = [(-behind, -gradient * behind), (ahead, gradient * ahead)]
     smooth = polyline(rng.uniform(-math.pi, math.pi), corners)
     terrain = Sum((smooth, rough(rng, 0.01, (1.0, 8.0))))
-    solids = _around(smooth, terrain, rng, (6.0, 28.0))
-    return Scene('on_ramp', terrain, solids, leans=True)
+    return terrain, _around(smooth, terrain, rng, (6.0, 28.0)), (), True
 
 
-def _dike(seed: int) -> Scene:
+def _dike(rng: np.random.Generator) -> Made:
     """Dike 5 to 8 m wide, 1 to 2 m above the ground on both sides; the vehicle stands on it."""
-    rng = np.random.default_rng(seed)
     heading, gradient = rng.uniform(-math.pi, math.pi), rng.uniform(0.4, 0.7)
     half, high = rng.uniform(2.5, 4.0), rng.uniform(1.0, 2.0)
     foot = half + high / gradient
@@ -392,36 +377,32 @@ def _dike(seed: int) -> Scene:
     terrain = Sum((smooth, rough(rng, 0.02, (1.0, 8.0))))
     along = _Line(terrain, rng, heading - 0.5 * math.pi, 0.0)
     places = [along.at(k, rng.uniform(-0.6, 0.6) * half) for k in ENDS]
-    return Scene('dike', terrain, _around(smooth, terrain, rng, (6.0, 32.0), places))
+    return terrain, _around(smooth, terrain, rng, (6.0, 32.0), places)
 
 
-def _low_box(rng: np.random.Generator) -> tuple[Kind, objects.Size]:
-    """Box, half of them 0.44 m wide, the others up to 2 m by 2 m."""
+def _low_box(rng: np.random.Generator) -> objects.Size:
+    """Size of a box, half of them 0.44 m wide, the others up to 2 m by 2 m."""
     length, width = rng.uniform(0.8, 2.0, 2) if rng.random() < 0.5 else (0.44, 0.44)
-    return Kind.BOX, (length, width, float(rng.choice(LOW_HEIGHTS)))
+    return length, width, float(rng.choice(LOW_HEIGHTS))
 
 
-_LOW_OBJECTS: dict[str, tuple[Callable[[np.random.Generator], tuple[Kind, objects.Size]], str]] = {
-    'low_boxes': (_low_box, 'flat'),
-    'low_boxes_rough': (_low_box, 'rough'),
-    'lying_persons': (lambda rng: (Kind.PERSON, (1.7, 0.45, 0.22)), 'flat'),
-}
-
-
-def _low_scene(name: str, seed: int) -> Scene:
+def _low(
+    ground: str,
+    kind: Kind,
+    size: Callable[[np.random.Generator], objects.Size],
+    rng: np.random.Generator,
+) -> Made:
     """Low objects all around the sensor, turned at random, each in plain view."""
-    rng = np.random.default_rng(seed)
-    make, ground = _LOW_OBJECTS[name]
     terrain = _OPEN_COUNTRY[ground](rng)
     solids: list[Solid] = []
     start = bearing = rng.uniform(-math.pi, math.pi)
     while True:
-        kind, (length, width, height) = make(rng)
+        length, width, height = size(rng)
         turned = rng.uniform(-1.0, 1.0) * (0.5 * math.pi)
         cos, sin, near = math.cos(turned), abs(math.sin(turned)), rng.uniform(*LOW_DISTANCE)
         half = math.atan2(0.5 * (length * cos + width * sin), near)
         if bearing + 2.0 * half + LOW_GAP > start + 2.0 * math.pi:
-            return Scene(name, terrain, tuple(solids))
+            return terrain, solids
         middle, away = bearing + half, near + 0.5 * (length * sin + width * cos)
         x, y, yaw = away * math.cos(middle), away * math.sin(middle), middle + 0.5 * math.pi
         box = objects.standing_box(terrain, x, y, (length, width, height), yaw + turned, kind)
@@ -429,20 +410,40 @@ def _low_scene(name: str, seed: int) -> Scene:
         bearing += 2.0 * half + LOW_GAP
 
 
-Build = Callable[[int], Scene]
-"""Makes a scene of a seed."""
-DRIVES: dict[str, Build] = {
-    **{name: functools.partial(_open_scene, name) for name in _OPEN_COUNTRY},
-    'urban': _urban,
-}
+def _build(name: str, make: Callable[[np.random.Generator], Made], seed: int) -> Scene:
+    """Make a scene of a seed."""
+    terrain, solids, *more = make(np.random.default_rng(seed))
+    return Scene(name, terrain, tuple(solids), *more)
+
+
+def _named(**makers: Callable[[np.random.Generator], Made]) -> dict[str, Callable[[int], Scene]]:
+    """Functions of a seed, by the names of their scenes."""
+    return {name: partial(_build, name, make) for name, make in makers.items()}
+
+
+DRIVES = _named(
+    **{name: partial(_open, make) for name, make in _OPEN_COUNTRY.items()}, urban=_urban
+)
 """Scenes whose lane along x is free, by name."""
-LOW: dict[str, Build] = {name: functools.partial(_low_scene, name) for name in _LOW_OBJECTS}
+LOW = _named(
+    low_boxes=partial(_low, 'flat', Kind.BOX, _low_box),
+    low_boxes_rough=partial(_low, 'rough', Kind.BOX, _low_box),
+    lying_persons=partial(_low, 'flat', Kind.PERSON, lambda rng: (1.7, 0.45, 0.22)),
+)
 """Scenes of low objects."""
-STEEP = {'hills': _hills, 'valley': _valley, 'bank': _bank, 'on_ramp': _on_ramp, 'dike': _dike}
+STEEP = {
+    **_named(hills=_hills, valley=_valley),
+    # Seeds take turns with the slopes.
+    'bank': lambda seed: _build('bank', partial(_bank, BANKS[seed % len(BANKS)]), seed),
+    **_named(on_ramp=_on_ramp, dike=_dike),
+}
 """Scenes of steep ground."""
 PLACES = {
-    'traffic_jam': _traffic_jam, 'car_park': _car_park, 'hidden_climb': _hidden_climb,
-    'wet_road': _wet_road, 'blind_slope': _blind_slope, 'hedge': _hedge, **LOW, **STEEP,
+    **_named(
+        traffic_jam=_traffic_jam, car_park=_car_park, hidden_climb=_hidden_climb,
+        wet_road=_wet_road, blind_slope=partial(_open, _blind_slope), hedge=_hedge,
+    ),
+    **LOW, **STEEP,
 }  # fmt: skip
 """All scenes around a sensor at the origin."""
 SCENES = {**DRIVES, **PLACES}
