@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
@@ -85,8 +86,9 @@ CUT = (
     '--cut',
     f'height [m] at which objects are cut, to count low objects (default: {CUT_HEIGHT}); '
     '0 = no low objects: each method segments a frame once',
-    {'metavar': 'HEIGHT', 'type': partial(options.above_zero, or_zero=True)},
-)
+    {'metavar': 'HEIGHT',
+     'type': options.value(float, lambda z: 0.0 <= z < math.inf, 'a number, at least 0')},
+)  # fmt: skip
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -95,10 +95,13 @@ def _notes(arguments: argparse.Namespace) -> AbstractContextManager[None]:
     """Print what the library logs as notes, except in a node, which logs by way of ROS."""
     if hasattr(arguments, 'accepts_ros_args'):
         return nullcontext()
-    from gp_ground_seg.cli.options import note
+
+    def note(_level: int, text: str) -> None:
+        with suppress(OSError):  # standard error may be full
+            print(f'gp-ground-seg: note: {shown(text)}', file=sys.stderr)
 
     level = logging.WARNING if getattr(arguments, 'quiet', False) else logging.INFO
-    return messages_passed_to(lambda _, text: note(text), level)
+    return messages_passed_to(note, level)
 
 
 @contextmanager

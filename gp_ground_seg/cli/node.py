@@ -7,7 +7,13 @@ import sys
 import time
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import GroundSegError, MissingDependencyError, install_hint, shown
+from gp_ground_seg.core.errors import (
+    LOGGER,
+    GroundSegError,
+    MissingDependencyError,
+    install_hint,
+    shown,
+)
 from gp_ground_seg.ros.node_process import run_node
 
 NODE_EXAMPLES = """\
@@ -60,7 +66,7 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
         raise MissingDependencyError(
             f'numba is not installed, nothing to compile: {install_hint("numba")}'
         )
-    options.note('compiling what is not on disk yet: 20 to 60 s for all of it')
+    LOGGER.info('compiling what is not on disk yet: 20 to 60 s for all of it')
     begin = time.monotonic()
     compile_all()
     seconds, folder = time.monotonic() - begin, code_folder()

@@ -1,9 +1,8 @@
-"""Shared by the commands: options, kinds of values, notes, progress over frames."""
+"""Shared by the commands: options, kinds of values, progress over frames."""
 
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 import textwrap
 from collections.abc import Callable, Iterable
@@ -14,7 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from gp_ground_seg.core.errors import ConfigError, DataError, in_thousands, shown
+from gp_ground_seg.core.errors import LOGGER, ConfigError, DataError, in_thousands
 from gp_ground_seg.core.jit import has_to_compile
 from gp_ground_seg.core.parameters.config import PRESETS, Config, find_preset
 from gp_ground_seg.core.parameters.schema import load_yaml
@@ -65,17 +64,36 @@ def command(
     return parser
 
 
-def positive(word: str, least: int = 1) -> int:
-    """Whole number, at least 1."""
-    if not word.isdecimal() or int(word) < least:
-        raise argparse.ArgumentTypeError(f'{word!r}: must be a whole number, at least {least}')
-    return int(word)
+def value(read: Callable[[str], Any], accepts: Callable[[Any], Any], wanted: str) -> Any:
+    """Return the type of an option: what `read` makes of its text, if that is accepted."""
+
+    def parse(text: str) -> Any:
+        with suppress(ValueError):
+            if accepts(found := read(text)):
+                return found
+        raise argparse.ArgumentTypeError(f'{text!r}: must be {wanted}')
+
+    return parse
 
 
-NUMBER: dict[str, Any] = {'metavar': 'N', 'type': positive}
+def whole(least: int) -> dict[str, Any]:
+    """Return what `add_argument` takes of a whole number."""
+    wanted = f'a whole number, at least {least}'
+    read = value(lambda text: text.isdecimal() and int(text), lambda n: n >= least, wanted)
+    return {'metavar': 'N', 'type': read}
+
+
+def some_of(known: Iterable[str]) -> Any:
+    """Return the type of a comma-separated list of `known` names, each at most once."""
+    names = list(known)
+    wanted = f'some of {",".join(names)}, each once'
+    return value(lambda t: t.split(','), lambda w: len({*w} & {*names}) == len(w), wanted)
+
+
+NUMBER = whole(1)
 COLUMNS: Option = (
     '--columns', f'numbers per point of a .bin scan, x y z first (default: {KITTI_COLUMNS})',
-    {'metavar': 'N', 'type': partial(positive, least=MIN_COLUMNS)},
+    whole(MIN_COLUMNS),
 )  # fmt: skip
 """Option of every command that reads ``.bin`` scans."""
 CLOUDS: tuple[Option, ...] = (
@@ -128,29 +146,6 @@ def runner(arguments: argparse.Namespace, title: str) -> AbstractContextManager[
     return open_runner(arguments.workers, arguments.scheduler, bar)
 
 
-def above_zero(text: str, *, or_zero: bool = False) -> float:
-    """Read a number above 0, or 0."""
-    number = float(text)
-    if not (0.0 < number < math.inf or (or_zero and number == 0.0)):
-        least = 'at least 0' if or_zero else 'above 0'
-        raise argparse.ArgumentTypeError(f'{text!r}: must be a number, {least}')
-    return number
-
-
-def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:
-    """Return the type of a comma-separated list of `known` names, each at most once."""
-    names = list(known)
-
-    def parse(text: str) -> list[str]:
-        words = text.split(',')
-        if len({*words} & {*names}) < len(words):
-            wanted = f'some of {",".join(names)}, each once'
-            raise argparse.ArgumentTypeError(f'{text!r}: must be {wanted}')
-        return words
-
-    return parse
-
-
 def read_config(arguments: argparse.Namespace) -> Config:
     """Return the preset, changed by the file, changed by the settings."""
     config = find_preset(arguments.preset).config
@@ -173,7 +168,7 @@ def spare_compiling(config: Config, n_scans: int) -> Config:
 def note_spared(given: Config, used: Config) -> None:
     """Say how to have compiled code, where `spare_compiling` has done without."""
     if used.runtime != given.runtime:
-        note('segmented with numpy; to have compiled code, run gp-ground-seg warm-up once')
+        LOGGER.info('segmented with numpy; to have compiled code, run gp-ground-seg warm-up once')
 
 
 def parse_setting(setting: str) -> tuple[str, Any]:
@@ -185,12 +180,6 @@ def parse_setting(setting: str) -> tuple[str, Any]:
         return name.strip(), load_yaml(text)
     except ConfigError as error:
         raise ConfigError(f'--set {name}: {error}') from error
-
-
-def note(message: str) -> None:
-    """Print a line on standard error that is neither result nor error."""
-    with suppress(OSError):  # standard error may be full
-        print(f'gp-ground-seg: note: {shown(message)}', file=sys.stderr)
 
 
 def count(number: int, noun: str) -> str:

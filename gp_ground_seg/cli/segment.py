@@ -104,8 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
             write_file(folder / PARAMETERS, parameters.encode())
         found = runner.run(write, left)
     _print_summary([*chain(*found)], target, runner.n_workers)
-    if not arguments.quiet:
-        options.note_spared(config, used)
+    options.note_spared(config, used)
     return 0
 
 
