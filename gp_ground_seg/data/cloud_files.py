@@ -149,14 +149,15 @@ def read_file(path: Path, columns: int = KITTI_COLUMNS) -> Cloud:
     Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, or can be no scan.
     nuScenes' ``.pcd.bin`` is known by its name.
     """
-    suffix = path.suffix.lower()
-    if suffix == '.bin':
-        if path.name.endswith(NUSCENES_SUFFIX) and columns == KITTI_COLUMNS:
-            columns = NUSCENES_COLUMNS
-        table = read_scan(path, columns)
-        return Cloud(name_columns(table), four_columns(table))
-    cloud = decode_file(path, read_bytes(path, MAX_SCAN_BYTES))
-    check_scan(path, cloud.xyz)
+    data, is_bin = read_bytes(path, MAX_SCAN_BYTES), path.suffix.lower() == '.bin'
+    if path.name.endswith(NUSCENES_SUFFIX) and columns == KITTI_COLUMNS:
+        columns = NUSCENES_COLUMNS
+    cloud = _read_bin(path, data, columns) if is_bin else decode_file(path, data)
+    with np.errstate(all='ignore'):
+        problem = find_objection(cloud.xyz[:, :3])
+    if problem:
+        more = '; a .bin holds float32: --columns chooses their number' if is_bin else ''
+        raise DataError(f'{path}: {problem}{more}')
     return cloud
 
 
@@ -196,27 +197,23 @@ def encode_output(path: Path, cloud: Cloud, result: Segmentation) -> bytes:
     return encode_file(path, cloud, {'label': result.label, **values})
 
 
-def read_scan(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[np.float32]:
-    """Read a ``.bin`` file of float32, x, y, z [m] first in each point: (N, columns).
-
-    Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
-    points, or can be no scan.
-    """
-    data = read_bytes(path, MAX_SCAN_BYTES)
+def _read_bin(path: Path, data: bytes, columns: int) -> Cloud:
+    """Cloud of float32, x, y, z [m] first in each point; a missing intensity is zero."""
     if len(data) % (4 * columns):
         raise DataError(
             f'{path}: {len(data)} bytes is not a whole number of points of {columns} float32: '
             'truncated? --columns chooses another number'
         )
     numbers = np.frombuffer(data, '<f4').astype(np.float32)
-    table = numbers.reshape(-1, columns)
     if better := find_columns(numbers, columns):
         raise DataError(
             f'{path}: read with {columns} columns each is a mixture; the points have {better} '
             f'numbers each: use --columns {better}'
         )
-    check_scan(path, table)
-    return table
+    table = numbers.reshape(-1, columns)
+    points = np.zeros((len(table), 4), dtype=np.float32)
+    points[:, :columns] = table[:, :4]
+    return Cloud(name_columns(table), points)
 
 
 def find_columns(numbers: npt.NDArray[np.float32], columns: int) -> int:
@@ -247,30 +244,11 @@ def _information(classes: npt.NDArray[np.intp], n: int) -> float:
     return float(np.log(n) + entr(share.sum(axis=0)).sum() - entr(share).sum())
 
 
-def four_columns(table: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
-    """Return x, y, z, intensity of a table (N, >= 3), (N, 4); a missing intensity is zero."""
-    points = np.zeros((len(table), 4), dtype=np.float32)
-    points[:, : table.shape[1]] = table[:, :4]
-    return points
-
-
-def check_scan(place: str | Path, xyz: npt.NDArray[np.floating]) -> None:
-    """Raise DataError, with the file or message, where points (N, >= 3) can be no scan."""
-    with np.errstate(all='ignore'):
-        problem = find_objection(xyz[:, :3])
-    if problem:
-        is_bin = str(place).endswith('.bin')
-        more = '; a .bin holds float32: --columns chooses their number' if is_bin else ''
-        raise DataError(f'{place}: {problem}{more}')
-
-
 def find_objection(xyz: npt.NDArray[np.floating]) -> str:
     """Return why points (N, 3) can be no scan, or ''."""
     # All are looked at where some of them raise a doubt.
-    return _objection(xyz[:: 1 + len(xyz) // _N_JUDGED]) and _objection(xyz)
-
-
-def _objection(xyz: npt.NDArray[np.floating]) -> str:
+    if len(xyz) > _N_JUDGED and not find_objection(xyz[:: 1 + len(xyz) // _N_JUDGED]):
+        return ''
     finite = xyz[finite_points(xyz)]
     if not len(finite):
         return f'none of {len(xyz)} points is finite' if len(xyz) else 'no points in it'

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.errors import LOGGER, DataError
 from gp_ground_seg.core.frame import BoolArray
-from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, four_columns, read_scan
+from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, read_file
 from gp_ground_seg.data.files import naming, read_bytes
 
 UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70
@@ -154,7 +154,7 @@ def read_points(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[n
     Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
     points, or can be no scan.
     """
-    return four_columns(read_scan(path, columns))
+    return read_file(Path(path), columns).xyz.astype(np.float32, copy=False)
 
 
 def read_entries(path: str | Path, n_points: int) -> npt.NDArray[np.uint32]:
