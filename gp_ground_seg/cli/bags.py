@@ -13,13 +13,8 @@ import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
-from gp_ground_seg.data.bags import (
-    POINT_CLOUD2,
-    BagReader,
-    cloud_from_columns,
-    encode_cloud,
-    new_bag,
-)
+from gp_ground_seg.data import bags
+from gp_ground_seg.data.bags import POINT_CLOUD2, BagReader
 from gp_ground_seg.data.point_cloud2 import CloudMessage
 from gp_ground_seg.data.semantic_kitti import list_frames
 from gp_ground_seg.ros.session import large_cloud_transport, needing_ros, ros_session
@@ -94,7 +89,7 @@ def scan_cloud(
 ) -> CloudMessage:
     """Return points (N, 4), x y z [m] intensity, and `further` fields (N,) as a cloud."""
     columns = {name: points[:, k] for k, name in enumerate(('x', 'y', 'z', 'intensity'))}
-    return cloud_from_columns(divmod(stamp_ns, 10**9), frame_id, {**columns, **further})
+    return bags.cloud_from_columns(divmod(stamp_ns, 10**9), frame_id, {**columns, **further})
 
 
 def run_convert(arguments: argparse.Namespace) -> int:
@@ -106,12 +101,12 @@ def run_convert(arguments: argparse.Namespace) -> int:
         raise DataError(f'times.txt of sequence {arguments.sequence}: {times}: no stamps of ROS')
     n_points = n_labelled = 0
     progress = options.progress('kitti-to-bag', quiet=arguments.quiet)
-    with new_bag(arguments.output, {TOPIC: POINT_CLOUD2}, force=arguments.force) as write:
+    with bags.new_bag(arguments.output, {TOPIC: POINT_CLOUD2}, force=arguments.force) as write:
         for frame, stamp in progress([*zip(frames, stamps, strict=True)]):
             points, labels = frame.points, {}
             if frame.labels_path is not None:
                 labels['label'] = frame.semantic.astype(np.uint32)
-            write(TOPIC, stamp, encode_cloud(scan_cloud(points, stamp, FRAME_ID, **labels)))
+            write(TOPIC, stamp, bags.encode_cloud(scan_cloud(points, stamp, FRAME_ID, **labels)))
             n_points += len(points)
             n_labelled += len(labels)
     n_frames, n_all = options.count(len(frames), 'frame'), options.count(n_points, 'point')

@@ -20,23 +20,9 @@ from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame, is_root, labelled_frames
 from gp_ground_seg.lab.cluster import Runner
 from gp_ground_seg.lab.experiments import EXPERIMENTS, simulated_frames
-from gp_ground_seg.lab.scoring import tables
-from gp_ground_seg.lab.scoring.evaluate import (
-    KnownScan,
-    Method,
-    OurMethod,
-    Scores,
-    load_kitti,
-    score_methods,
-)
+from gp_ground_seg.lab.scoring import evaluate, report, tables
 from gp_ground_seg.lab.scoring.objects import CUT_HEIGHT
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
-from gp_ground_seg.lab.scoring.report import (
-    Report,
-    changed_parameters,
-    describe_environment,
-    machine_line,
-)
 from gp_ground_seg.lab.simulation import SCENES, SENSORS
 
 DESCRIPTION = """\
@@ -138,12 +124,12 @@ def run_evaluate(arguments: argparse.Namespace) -> int:
     config = options.read_config(arguments)
     cut = CUT_HEIGHT if arguments.cut is None else float(arguments.cut)
     changed: list[str] = []
-    methods: list[Method] = [OurMethod(config)]
+    methods: list[evaluate.Method] = [evaluate.OurMethod(config)]
     if arguments.peer is not None:
         methods.append(PatchworkppMethod.of_sensor(config.sensor))
     if arguments.against is not None:
         other = config_of(arguments.against)
-        methods.append(OurMethod(other, shown(Path(arguments.against).name)))
+        methods.append(evaluate.OurMethod(other, shown(Path(arguments.against).name)))
         changed = [
             f'{spec.name}: {yaml_scalar(before)} -> {yaml_scalar(after)} {spec.unit}'.rstrip()
             for spec, before, after in other.differences(config)
@@ -152,12 +138,12 @@ def run_evaluate(arguments: argparse.Namespace) -> int:
             raise ConfigError(f'--against {arguments.against}: the same parameters as given')
     items, load = _items(arguments, cut)
     with reporting_runner(arguments, 'evaluate') as runner:
-        scores = score_methods(items, methods, load, runner=runner)
+        scores = evaluate.score_methods(items, methods, load, runner=runner)
     if changed:
         print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
-    report = tables.evaluation(scores, config)
-    print_report(arguments, report, runner, data=arguments.root, cut=cut)
-    changes = [f'{name}={value}' for name, value in changed_parameters(config).items()]
+    found = tables.evaluation(scores, config)
+    print_report(arguments, found, runner, data=arguments.root, cut=cut)
+    changes = [f'{name}={value}' for name, value in report.changed_parameters(config).items()]
     print('', f'parameters: {", ".join(changes) or "defaults"}', *_result_lines(scores), sep='\n')
     return 0
 
@@ -181,8 +167,8 @@ def run_experiment(arguments: argparse.Namespace) -> int:
         else frames_from_options(arguments)
     )
     with reporting_runner(arguments, name) as runner:
-        report = experiment.run(scans, config, runner)
-    print_report(arguments, report, runner, experiment=name)
+        found = experiment.run(scans, config, runner)
+    print_report(arguments, found, runner, experiment=name)
     return 0
 
 
@@ -196,22 +182,22 @@ def reporting_runner(arguments: argparse.Namespace, title: str) -> AbstractConte
 
 
 def print_report(
-    arguments: argparse.Namespace, report: Report, runner: Runner, **facts: Any
+    arguments: argparse.Namespace, found: report.Report, runner: Runner, **facts: Any
 ) -> None:
     """Write ``--json`` with `facts`, and print the tables."""
-    environment = {**describe_environment(PEER), 'n_workers': runner.n_workers}
+    environment = {**report.describe_environment(PEER), 'n_workers': runner.n_workers}
     if arguments.json:
-        data = report.encode(environment, **facts)
+        data = found.encode(environment, **facts)
         write_file(Path(arguments.json), data, force=arguments.force)
-    machine = machine_line(environment, report.backend)
-    print(report.text(machine, markdown=arguments.markdown))
+    machine = report.machine_line(environment, found.backend)
+    print(found.text(machine, markdown=arguments.markdown))
 
 
-def _items(arguments: argparse.Namespace, cut: float) -> tuple[Any, Callable[[Any], KnownScan]]:
+def _items(arguments: argparse.Namespace, cut: float) -> tuple[Any, Callable[[Any], Any]]:
     """Return labelled frames, or with ``--against`` any clouds, and the reader of a cloud."""
     root = Path(arguments.root)
     if is_root(root):
-        return frames_from_options(arguments), partial(load_kitti, cut=cut)
+        return frames_from_options(arguments), partial(evaluate.load_kitti, cut=cut)
     if not root.exists():
         raise DataError(f'{root}: no such file or folder')
     if arguments.against is None:
@@ -223,10 +209,10 @@ def _items(arguments: argparse.Namespace, cut: float) -> tuple[Any, Callable[[An
     options.refuse(arguments, names, f'{root} has no sequences/*/velodyne below it')
     inputs = list_inputs(root, options.columns_of(arguments))
     name = shown(inputs.path.stem)
-    return inputs, lambda item: KnownScan(name, shown(item.name), item.read().xyz)
+    return inputs, lambda item: evaluate.KnownScan(name, shown(item.name), item.read().xyz)
 
 
-def _result_lines(scores: Scores) -> list[str]:
+def _result_lines(scores: evaluate.Scores) -> list[str]:
     """Return a line for each method on all its scans, ours the last."""
     pooled, lines = tables.measured(scores.scans), []
     medians = scores.scans.groupby('method')['seconds'].median()

@@ -20,15 +20,7 @@ from gp_ground_seg.data.cloud_files import FORMATS, LABELS
 from gp_ground_seg.data.files import write_file
 from gp_ground_seg.data.inputs import Inputs, holds_bag
 from gp_ground_seg.data.semantic_kitti import is_root, list_sequences
-from gp_ground_seg.lab.dataset import (
-    PARAMETERS,
-    Outcome,
-    find_difference,
-    find_left,
-    output_of,
-    segment_bag,
-    segment_scans,
-)
+from gp_ground_seg.lab import dataset
 
 DESCRIPTION = """\
 Split scans into ground and obstacles.
@@ -88,20 +80,20 @@ def run(arguments: argparse.Namespace) -> int:
     folder, place = (target.parent, target) if is_one else (target, target.resolve())
     if not place.parent.is_dir():
         raise DataError(f'{target}: the folder {place.parent} does not exist')
-    outputs = [target] if is_one else [output_of(folder, form, scan) for scan in scans]
+    outputs = [target] if is_one else [dataset.output_of(folder, form, scan) for scan in scans]
     parameters = None if is_one else _parameters(arguments, config)
-    left = find_left(scans, outputs, folder, parameters, force=arguments.force)
+    left = dataset.find_left(scans, outputs, folder, parameters, force=arguments.force)
     if len(left) < len(scans):
         print(f'{len(scans) - len(left)} of {len(scans)} were finished before')
     if not left:
         return 0
     used = options.spare_compiling(config, len(left))
-    write = partial(segment_scans, folder, form, used)
+    write = partial(dataset.segment_scans, folder, form, used)
     if is_one and scans.topic:
-        write = partial(segment_bag, target, used)
+        write = partial(dataset.segment_bag, target, used)
     with options.runner(arguments, 'segment') as runner:
-        if parameters and (arguments.force or find_difference(folder, parameters)):
-            write_file(folder / PARAMETERS, parameters.encode())
+        if parameters and (arguments.force or dataset.find_difference(folder, parameters)):
+            write_file(folder / dataset.PARAMETERS, parameters.encode())
         found = runner.run(write, left)
     _print_summary([*chain(*found)], target, runner.n_workers)
     options.note_spared(config, used)
@@ -158,7 +150,7 @@ def _default_output(source: Path, form: str | None = None) -> Path:
     return named.with_name(f'{named.stem}_ground{suffix}')
 
 
-def _print_summary(found: Sequence[Outcome], target: Path, n_workers: int = 0) -> None:
+def _print_summary(found: Sequence[dataset.Outcome], target: Path, n_workers: int = 0) -> None:
     """Print points, ground, time, and height and tilt of the sensor."""
     seconds = [one.seconds for one in found]
     n_points, n_ground = sum(one.n_points for one in found), sum(one.n_ground for one in found)

@@ -20,18 +20,8 @@ import numpy.typing as npt
 from gp_ground_seg.core.errors import DataError, PointCloudError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.pipeline.points import finite_points, hint_of_table, objection_to_ranges
-from gp_ground_seg.data.clouds import (
-    Cloud,
-    Columns,
-    Fields,
-    check_numbers,
-    cloud_of,
-    coordinate_names,
-    count_numbers,
-    gather,
-    name_columns,
-    scatter,
-)
+from gp_ground_seg.data import clouds
+from gp_ground_seg.data.clouds import Cloud, Columns, Fields
 from gp_ground_seg.data.files import MAX_SCAN_BYTES, naming, read_bytes
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
@@ -69,13 +59,13 @@ def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
         raise PointCloudError(f'is no file of numpy; it begins with {data[:20]!r}')
     found = np.load(io.BytesIO(data), allow_pickle=False)
     arrays: Columns = {TABLE: found} if isinstance(found, np.ndarray) else dict(found)
-    if coordinate_names(arrays)[0] not in arrays:
+    if clouds.coordinate_names(arrays)[0] not in arrays:
         table = arrays.pop(_table_of(arrays))
-        arrays = {**scatter(_points_of(table)), **arrays}
+        arrays = {**clouds.scatter(_points_of(table)), **arrays}
     first = next(iter(arrays.values()))
-    x = arrays.get(coordinate_names(arrays)[0], first)
+    x = arrays.get(clouds.coordinate_names(arrays)[0], first)
     fields = {name: v for name, v in arrays.items() if v.shape[:1] == x.shape[:1]}
-    return gather(fields), {name: v for name, v in arrays.items() if name not in fields}
+    return clouds.gather(fields), {name: v for name, v in arrays.items() if name not in fields}
 
 
 def _table_of(arrays: Columns) -> str:
@@ -106,7 +96,7 @@ def _points_of(table: npt.NDArray[Any]) -> Fields:
     if 0 < table.shape[0] < table.shape[1] >= _TRANSPOSED:
         problem = 'is transposed, or an image of ranges; a point is a row: save its .T'
         raise PointCloudError(f'array of shape {table.shape}: {problem}')
-    return name_columns(table)
+    return clouds.name_columns(table)
 
 
 def _encode_npy(cloud: Cloud) -> bytes:
@@ -121,7 +111,7 @@ def _encode_npz(cloud: Cloud) -> bytes:
     """File of an array for each field, and of arrays of another length."""
     file = io.BytesIO()
     others = cloud.header if isinstance(cloud.header, dict) else {}
-    arrays: dict[str, Any] = {**others, **scatter(cloud.fields)}
+    arrays: dict[str, Any] = {**others, **clouds.scatter(cloud.fields)}
     np.savez(file, **arrays)
     return file.getvalue()
 
@@ -165,8 +155,8 @@ def decode_file(path: Path, data: bytes) -> Cloud:
     """Cloud of the data of a file, of the format of `path`; DataError if it cannot be read."""
     with naming(path, f'cannot be read as {path.suffix}; is it whole?'), np.errstate(all='ignore'):
         fields, header = _READERS[path.suffix.lower()](data)
-        check_numbers(count_numbers(fields.dtype))
-        return cloud_of(fields, header)
+        clouds.check_numbers(clouds.count_numbers(fields.dtype))
+        return clouds.cloud_of(fields, header)
 
 
 def encode_file(path: Path, cloud: Cloud, columns: Columns) -> bytes:
@@ -213,7 +203,7 @@ def _read_bin(path: Path, data: bytes, columns: int) -> Cloud:
     table = numbers.reshape(-1, columns)
     points = np.zeros((len(table), 4), dtype=np.float32)
     points[:, :columns] = table[:, :4]
-    return Cloud(name_columns(table), points)
+    return Cloud(clouds.name_columns(table), points)
 
 
 def find_columns(numbers: npt.NDArray[np.float32], columns: int) -> int:

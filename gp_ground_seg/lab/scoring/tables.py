@@ -14,18 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.lab.scoring import metrics, objects
+from gp_ground_seg.lab.scoring import metrics, objects, report
 from gp_ground_seg.lab.scoring.evaluate import ALL, KEYS, STAGE, Scores, sums
 from gp_ground_seg.lab.scoring.metrics import Measure, ratio, share
-from gp_ground_seg.lab.scoring.report import (
-    PEER,
-    SHARE,
-    Form,
-    Report,
-    Table,
-    records,
-    require_pandas,
-)
+from gp_ground_seg.lab.scoring.report import Form, Report, Table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -135,10 +127,8 @@ def beside(found: DataFrame, scores: Scores) -> DataFrame:
     ours = found.loc[scores.methods[0]]
     if not scores.peer:
         return ours
-    both = ours.join(found.loc[scores.peer, found.columns.intersection(PEERS)].add_prefix(PEER))
-    both = both[[
-        column for name in ours for column in (name, f'{PEER}{name}') if column in both
-    ]]  # fmt: skip
+    theirs = found.loc[scores.peer].filter(PEERS).add_prefix(report.PEER)
+    both = ours.join(theirs).filter([part for name in ours for part in (name, report.PEER + name)])
     return both.assign(difference=both['iou'] - both['peer_iou']) if 'iou' in both else both
 
 
@@ -165,7 +155,7 @@ def measured(rows: DataFrame, *by: str) -> DataFrame:
 
 def make_report(tables: dict[str, Table], scores: Scores, config: Config) -> Report:
     """Report of scored variants of `config`; its rows are the scans, with sums and measures."""
-    rows = records(with_measures(scores.scans))
+    rows = report.records(with_measures(scores.scans))
     return Report(tables, rows, str(scores.scans['backend'].iloc[0]), config)
 
 
@@ -225,7 +215,7 @@ def _grouped(
     """
     # The rows of all are each once more.
     parts = [frame] if by == 'class' else [frame, frame.assign(**{by: ALL})]
-    rows = require_pandas().concat(parts, ignore_index=True)
+    rows = report.require_pandas().concat(parts, ignore_index=True)
     found = measured(rows, by)
     if 'n_lost' in found:
         found['n_lost'] = found['n_lost'].where(found['n_objects'] > 0)
@@ -250,7 +240,7 @@ def difference_table(scores: Scores) -> Table:
     table['difference'] = table['given'] - table['peer']
     table['interval'] = [interval_text(scores, other, MEASURES[name]) for name in table.index]
     table = table.rename(index=COMPARED).reset_index(names='measure')
-    forms = {'given': Form('given', *SHARE), 'peer': Form(other, *SHARE)}
+    forms = {'given': Form('given', *report.SHARE), 'peer': Form(other, *report.SHARE)}
     title = f'Given minus {other}; {_changed_note(scores.scans, other)}; {interval_note(scores)}'
     return Table(title, table, forms)
 

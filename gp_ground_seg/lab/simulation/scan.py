@@ -10,13 +10,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from gp_ground_seg.core.frame import FloatArray
-from gp_ground_seg.lab.simulation.objects import (
-    Kind,
-    KindArray,
-    nearest_solid,
-    number_objects,
-    reflectance,
-)
+from gp_ground_seg.lab.simulation import objects
+from gp_ground_seg.lab.simulation.objects import Kind, KindArray
 from gp_ground_seg.lab.simulation.scenes import Scene
 from gp_ground_seg.lab.simulation.terrain import Terrain, first_hit
 
@@ -220,13 +215,13 @@ def _cast(
     origin = np.broadcast_to(position, direction.shape)
 
     distance = first_hit(scene.terrain, origin, direction, sensor.max_range)
-    solid_distance, solid = nearest_solid(scene.solids, position, direction)
+    solid_distance, solid = objects.nearest_solid(scene.solids, position, direction)
     blocked = solid_distance < distance
     distance = np.where(blocked, solid_distance, distance)
     # The last row of each table is of rays that meet no solid.
     solid = np.where(blocked, solid, -1)
     kind = np.array([*(hit.kind for hit in scene.solids), Kind.TERRAIN], dtype=np.uint8)[solid]
-    object_id = np.append(number_objects(scene.solids), np.int32(0))[solid]
+    object_id = np.append(objects.number_objects(scene.solids), np.int32(0))[solid]
     _mirror(scene, origin, direction, distance, kind, mirror_draw)
 
     measured = distance + sensor.range_std * range_noise
@@ -235,7 +230,7 @@ def _cast(
     kind = kind[kept]
     points = np.empty((len(kept), 4), dtype=np.float32)
     points[:, :3] = beams[kept] * measured[kept, None] + start
-    points[:, 3] = np.clip(reflectance(kind) + 0.05 * intensity_noise[kept], 0.0, 1.0)
+    points[:, 3] = np.clip(objects.reflectance(kind) + 0.05 * intensity_noise[kept], 0.0, 1.0)
     return points, kind, object_id[kept]
 
 
@@ -265,7 +260,7 @@ def _mirror(
     normal = np.column_stack([-slope, np.ones(len(slope))])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     across = np.sum(direction[ray] * normal, axis=1, keepdims=True)
-    onward, _ = nearest_solid(scene.solids, foot, direction[ray] - 2.0 * across * normal)
+    onward, _ = objects.nearest_solid(scene.solids, foot, direction[ray] - 2.0 * across * normal)
     found = np.isfinite(onward)
     distance[ray[is_deep & ~found]] = np.inf
     ray, total = ray[found], distance[ray[found]] + onward[found]
