@@ -14,13 +14,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from typing import NoReturn
 
 from gp_ground_seg import __version__
-from gp_ground_seg.core.errors import (
-    GroundSegError,
-    in_one_line,
-    messages_passed_to,
-    reason_of,
-    shown,
-)
+from gp_ground_seg.core import errors
 
 ROS_ARGS = '--ros-args'
 
@@ -57,7 +51,7 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise a GroundSegError, which names the help."""
-        raise GroundSegError(f'{message.removeprefix("argument ")}; see {self.prog} --help')
+        raise errors.GroundSegError(f'{message.removeprefix("argument ")}; see {self.prog} --help')
 
 
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:
@@ -87,7 +81,7 @@ def _parse(words: list[str]) -> argparse.Namespace:
     arguments = parser.parse_args(words[:n_before])
     arguments.ros_args = words[n_before:]
     if arguments.ros_args and not hasattr(arguments, 'accepts_ros_args'):
-        raise GroundSegError(f'{command}: {ROS_ARGS}: this command takes none')
+        raise errors.GroundSegError(f'{command}: {ROS_ARGS}: this command takes none')
     return arguments
 
 
@@ -98,10 +92,10 @@ def _notes(arguments: argparse.Namespace) -> AbstractContextManager[None]:
 
     def note(_level: int, text: str) -> None:
         with suppress(OSError):  # standard error may be full
-            print(f'gp-ground-seg: note: {shown(text)}', file=sys.stderr)
+            print(f'gp-ground-seg: note: {errors.shown(text)}', file=sys.stderr)
 
     level = logging.WARNING if getattr(arguments, 'quiet', False) else logging.INFO
-    return messages_passed_to(note, level)
+    return errors.messages_passed_to(note, level)
 
 
 @contextmanager
@@ -165,13 +159,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output went away, as `| head` does
         _abandon_stdout()
         return 0
-    except GroundSegError as error:
+    except errors.GroundSegError as error:
         line = str(error)
     except OSError as error:
         _abandon_stdout()
-        line = f'{error.filename or "input or output"}: {reason_of(error)}'
+        line = f'{error.filename or "input or output"}: {errors.reason_of(error)}'
     except UnicodeError as error:
-        line = f'{in_one_line(error)}: a name or text is not UTF-8'
+        line = f'{errors.in_one_line(error)}: a name or text is not UTF-8'
     except MemoryError:
         line = 'not enough memory for this input'
     except RuntimeError as error:  # of `Path.resolve`, before Python 3.13
@@ -181,5 +175,5 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('gp-ground-seg: interrupted', file=sys.stderr)
         return 130
-    print(f'gp-ground-seg: error: {shown(line)}', file=sys.stderr)
+    print(f'gp-ground-seg: error: {errors.shown(line)}', file=sys.stderr)
     return 2

@@ -7,13 +7,8 @@ import sys
 import time
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import (
-    LOGGER,
-    GroundSegError,
-    MissingDependencyError,
-    install_hint,
-    shown,
-)
+from gp_ground_seg.core import errors
+from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.ros.node_process import run_node
 
 NODE_EXAMPLES = """\
@@ -48,7 +43,7 @@ def main(*, is_managed: bool = False) -> int:
     try:
         return run_node(sys.argv[1:], is_managed=is_managed)
     except GroundSegError as error:
-        print(f'ground_segmentation_node: error: {shown(error)}', file=sys.stderr)
+        print(f'ground_segmentation_node: error: {errors.shown(error)}', file=sys.stderr)
         return 2
 
 
@@ -63,10 +58,10 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
     from gp_ground_seg.ros.loader import compile_all
 
     if not HAVE_NUMBA:
-        raise MissingDependencyError(
-            f'numba is not installed, nothing to compile: {install_hint("numba")}'
+        raise errors.MissingDependencyError(
+            f'numba is not installed, nothing to compile: {errors.install_hint("numba")}'
         )
-    LOGGER.info('compiling what is not on disk yet: 20 to 60 s for all of it')
+    errors.LOGGER.info('compiling what is not on disk yet: 20 to 60 s for all of it')
     begin = time.monotonic()
     compile_all()
     seconds, folder = time.monotonic() - begin, code_folder()

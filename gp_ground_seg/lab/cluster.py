@@ -22,14 +22,8 @@ from typing import Any
 from tqdm import tqdm
 
 from gp_ground_seg import __version__
-from gp_ground_seg.core.errors import (
-    LOGGER,
-    DataError,
-    in_one_line,
-    log_once,
-    messages_passed_to,
-    require,
-)
+from gp_ground_seg.core import errors
+from gp_ground_seg.core.errors import DataError, require
 
 BLOCK_SIZE = 64
 """Items of a block, where there are enough for all workers: they share what a task costs."""
@@ -78,7 +72,7 @@ class Runner:
             for future in as_completed(futures, loop=self.client.loop):
                 found[future], notes = _result_of(future, block_of[future])
                 for note in notes:
-                    log_once(*note)
+                    errors.log_once(*note)
                 bar.update(len(block_of[future]))
         return [found[future] for future in futures]
 
@@ -123,7 +117,7 @@ def _compute_block(version: str, function: Function, block: Sequence[Any]) -> tu
             f'a worker on {platform.node()} has gp_ground_seg {__version__}, not {version}'
         )
     notes = _Notes()
-    with messages_passed_to(lambda *message: notes.append(message)):
+    with errors.messages_passed_to(lambda *message: notes.append(message)):
         return function(block, iter), notes
 
 
@@ -137,10 +131,10 @@ def open_runner(
     """
     if scheduler is not None:
         with _connect(scheduler) as client:
-            LOGGER.info('dashboard: %s', client.dashboard_link)
+            errors.LOGGER.info('dashboard: %s', client.dashboard_link)
             n_workers = sum(client.nthreads().values())
             if not n_workers:
-                LOGGER.warning('the scheduler has no worker yet, waiting for one')
+                errors.LOGGER.warning('the scheduler has no worker yet, waiting for one')
             yield Runner(bar, client, n_workers)
     elif workers is not None:
         if workers > (most := 4 * (os.cpu_count() or 1)):
@@ -217,5 +211,5 @@ def _connect(address: str) -> Any:
     try:
         return distributed.Client(address, set_as_default=False, timeout=CONNECT_TIMEOUT)
     except (OSError, ValueError, TypeError, MemoryError) as error:  # memory: no Dask speaks there
-        text = f'--scheduler {address}: does not answer ({in_one_line(error)})'
+        text = f'--scheduler {address}: does not answer ({errors.in_one_line(error)})'
         raise DataError(text) from error

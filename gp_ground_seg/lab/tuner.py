@@ -22,13 +22,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import (
-    LOGGER,
-    DataError,
-    GroundSegError,
-    in_thousands,
-    require,
-)
+from gp_ground_seg.core import errors
+from gp_ground_seg.core.errors import DataError, require
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec
@@ -98,7 +93,7 @@ def open_server(port: int) -> Iterator[tuple[Any, str]]:
     with redirect_stdout(io.StringIO()), _guarded(token):
         server = viser.ViserServer(host=HOST, port=port, verbose=False)
     if port not in (0, server.get_port()):
-        LOGGER.warning('port %d is in use: %d instead', port, server.get_port())
+        errors.LOGGER.warning('port %d is in use: %d instead', port, server.get_port())
     server.initial_camera.position, server.initial_camera.look_at = CAMERA, TARGET
     try:
         yield server, f'http://{HOST}:{server.get_port()}/{token}'
@@ -117,7 +112,7 @@ def _guarded(token: str) -> Iterator[None]:
     viser calls; if a later viser does not call it, nothing is served.
     """
     module, is_guarded = require('websockets.asyncio.server', 'viser'), False
-    serve, silent = module.serve, LOGGER.getChild('websockets')
+    serve, silent = module.serve, errors.LOGGER.getChild('websockets')
     silent.setLevel(logging.CRITICAL)  # it logs a traceback for a page that sends nonsense
 
     def guarded(*args: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
@@ -331,7 +326,7 @@ def _tell(place: Any, action: Callable[[], str | None]) -> None:
     try:
         words = action()
     except Exception as error:
-        words = str(error) if isinstance(error, GroundSegError) else repr(error)
+        words = str(error) if isinstance(error, errors.GroundSegError) else repr(error)
     # Names and messages may come from a file.
     place.content = box(html.escape(words)) if words else ''
 
@@ -340,7 +335,7 @@ def _table(result: Segmentation, before: Labels, sums: Sequence[dict[str, Any]])
     """Numbers of a result and of labels before, and how many labels have changed."""
     both = result.label, before
     rows = {
-        word: [in_thousands(np.count_nonzero(label == value)) for label in both]
+        word: [errors.in_thousands(np.count_nonzero(label == value)) for label in both]
         for word, value in (('ground', Label.GROUND), ('obstacle', Label.OBSTACLE))
     }
     if 'tp' in sums[0]:
@@ -349,7 +344,7 @@ def _table(result: Segmentation, before: Labels, sums: Sequence[dict[str, Any]])
     rows['time'] = [f'{1e3 * result.timings["total"]:.0f} ms', '']
     is_ground = (result.label == Label.GROUND)[result.label != before]
     numbers = len(is_ground), int(is_ground.sum()), int((~is_ground).sum())
-    n_changed, n_ground, n_obstacle = map(in_thousands, numbers)
+    n_changed, n_ground, n_obstacle = map(errors.in_thousands, numbers)
     return '\n'.join(
         ['| | now | before |', '|---|--:|--:|',
          *(f'| {word} | {now} | {then} |' for word, (now, then) in rows.items()), '',
