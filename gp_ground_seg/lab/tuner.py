@@ -255,19 +255,18 @@ class Tuner:
             control.on_update(lambda _event: self._changed.set())
 
     def _add_control(self, spec: ParameterSpec) -> Callable[[], Any]:
-        """Add the control of a parameter, and return what reads it."""
+        """Add the control of a parameter, and return what reads it.
+
+        A number has a slider, and a checkbox for `AUTO` if it has that.
+        """
         gui, now = self._server.gui, self._start[spec.name]
         hint = f'{spec.description} ({spec.accepted})'
-        if spec.type not in (bool, str):
-            return self._add_number(spec, hint)
-        words = {str(option).lower(): option for option in spec.choices or (False, True)}
-        shown = gui.add_dropdown(spec.name, list(words), initial_value=str(now).lower(), hint=hint)
-        self._watch(shown)
-        return lambda: words[shown.value]
-
-    def _add_number(self, spec: ParameterSpec, hint: str) -> Callable[[], Any]:
-        """Add a slider, and a checkbox for `AUTO` where a parameter has that."""
-        gui, now = self._server.gui, self._start[spec.name]
+        if spec.type in (bool, str):
+            words = {str(option).lower(): option for option in spec.choices or (False, True)}
+            first = str(now).lower()
+            shown = gui.add_dropdown(spec.name, list(words), initial_value=first, hint=hint)
+            self._watch(shown)
+            return lambda: words[shown.value]
         low, high, step = slider_range(spec, now)
         number = spec.type(0.5 * (low + high) if now == AUTO else now)
         title = f'{spec.name} [{spec.unit}]' if spec.unit else spec.name

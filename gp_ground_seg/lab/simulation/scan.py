@@ -94,15 +94,11 @@ def _beams(*blocks: tuple[float, float, int]) -> tuple[float, ...]:
 # Fields of view, ranges and accuracies are those of the makers' data sheets, columns those at
 # 10 turns a second. Heights are typical mounts: KITTI's car for the HDL-64E, nuScenes' roof for
 # the HDL-32E, field robots for the VLP-16 and the Mid-360.
-HDL_64E, HDL_32E, VLP_16, OS1_128 = (
-    SensorModel(name, _beams(*blocks), n_columns, nearest, farthest, range_std, height)
-    for name, blocks, n_columns, nearest, farthest, range_std, height in (
-        ('hdl-64e', ((2.0, -8.33, 32), (-8.83, -24.33, 32)), 2000, 0.9, 120.0, 0.02, 1.73),
-        ('hdl-32e', ((10.67, -30.67, 32),), 2170, 0.9, 100.0, 0.02, 1.84),
-        ('vlp-16', ((15.0, -15.0, 16),), 1800, 0.5, 100.0, 0.03, 0.8),
-        ('os1-128', ((22.5, -22.5, 128),), 1024, 0.8, 120.0, 0.015, 1.8),
-    )
-)
+_BLOCKS = (2.0, -8.33, 32), (-8.83, -24.33, 32)
+HDL_64E = SensorModel('hdl-64e', _beams(*_BLOCKS), 2000, 0.9, 120.0, 0.02, 1.73)
+HDL_32E = SensorModel('hdl-32e', _beams((10.67, -30.67, 32)), 2170, 0.9, 100.0, 0.02, 1.84)
+VLP_16 = SensorModel('vlp-16', _beams((15.0, -15.0, 16)), 1800, 0.5, 100.0, 0.03, 0.8)
+OS1_128 = SensorModel('os1-128', _beams((22.5, -22.5, 128)), 1024, 0.8, 120.0, 0.015, 1.8)
 MID_360 = ScatterModel(
     'mid-360', (math.radians(52.0), math.radians(-7.0)), 1, 0.1, 40.0, range_std=0.02, height=0.5
 )
@@ -230,7 +226,7 @@ def _cast(
     kind = kind[kept]
     points = np.empty((len(kept), 4), dtype=np.float32)
     points[:, :3] = beams[kept] * measured[kept, None] + start
-    points[:, 3] = np.clip(objects.reflectance(kind) + 0.05 * intensity_noise[kept], 0.0, 1.0)
+    points[:, 3] = np.clip(objects.REFLECTANCE[kind] + 0.05 * intensity_noise[kept], 0.0, 1.0)
     return points, kind, object_id[kept]
 
 
