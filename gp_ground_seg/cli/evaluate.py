@@ -15,9 +15,7 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import ConfigError, DataError, require, shown
 from gp_ground_seg.core.parameters.config import config_of
 from gp_ground_seg.core.parameters.schema import yaml_scalar
-from gp_ground_seg.data.files import check_writable, write_file
-from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.data.semantic_kitti import Frame, is_root, labelled_frames
+from gp_ground_seg.data import files, inputs, semantic_kitti
 from gp_ground_seg.lab.cluster import Runner
 from gp_ground_seg.lab.experiments import EXPERIMENTS, simulated_frames
 from gp_ground_seg.lab.scoring import evaluate, report, tables
@@ -177,7 +175,7 @@ def reporting_runner(arguments: argparse.Namespace, title: str) -> AbstractConte
     if arguments.markdown:
         require('tabulate', 'tabulate')
     if arguments.json:
-        check_writable(arguments.json, force=arguments.force)
+        files.check_writable(arguments.json, force=arguments.force)
     return options.runner(arguments, title)
 
 
@@ -188,7 +186,7 @@ def print_report(
     environment = {**report.describe_environment(PEER), 'n_workers': runner.n_workers}
     if arguments.json:
         data = found.encode(environment, **facts)
-        write_file(Path(arguments.json), data, force=arguments.force)
+        files.write_file(Path(arguments.json), data, force=arguments.force)
     machine = report.machine_line(environment, found.backend)
     print(found.text(machine, markdown=arguments.markdown))
 
@@ -196,7 +194,7 @@ def print_report(
 def _items(arguments: argparse.Namespace, cut: float) -> tuple[Any, Callable[[Any], Any]]:
     """Return labelled frames, or with ``--against`` any clouds, and the reader of a cloud."""
     root = Path(arguments.root)
-    if is_root(root):
+    if semantic_kitti.is_root(root):
         return frames_from_options(arguments), partial(evaluate.load_kitti, cut=cut)
     if not root.exists():
         raise DataError(f'{root}: no such file or folder')
@@ -207,9 +205,9 @@ def _items(arguments: argparse.Namespace, cut: float) -> tuple[Any, Callable[[An
         )
     names = ('sequences', 'frame_step', 'cut', 'workers', 'scheduler')
     options.refuse(arguments, names, f'{root} has no sequences/*/velodyne below it')
-    inputs = list_inputs(root, options.columns_of(arguments))
-    name = shown(inputs.path.stem)
-    return inputs, lambda item: evaluate.KnownScan(name, shown(item.name), item.read().xyz)
+    found = inputs.list_inputs(root, options.columns_of(arguments))
+    name = shown(found.path.stem)
+    return found, lambda item: evaluate.KnownScan(name, shown(item.name), item.read().xyz)
 
 
 def _result_lines(scores: evaluate.Scores) -> list[str]:
@@ -230,9 +228,9 @@ def _result_lines(scores: evaluate.Scores) -> list[str]:
     return [f'{counted}; GroundGrid convention; median time of a frame', *lines]
 
 
-def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
+def frames_from_options(arguments: argparse.Namespace) -> list[semantic_kitti.Frame]:
     """Labelled frames of the options, grouped by sequence."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]
     columns, step = options.columns_of(arguments), arguments.frame_step or 1
-    return labelled_frames(arguments.root, chosen, columns, step)
+    return semantic_kitti.labelled_frames(arguments.root, chosen, columns, step)

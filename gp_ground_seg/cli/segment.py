@@ -15,11 +15,9 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
-from gp_ground_seg.data.bags import BAG_SUFFIXES
+from gp_ground_seg.data import bags, files, inputs, semantic_kitti
 from gp_ground_seg.data.cloud_files import FORMATS, LABELS
-from gp_ground_seg.data.files import write_file
-from gp_ground_seg.data.inputs import Inputs, holds_bag
-from gp_ground_seg.data.semantic_kitti import is_root, list_sequences
+from gp_ground_seg.data.inputs import Inputs
 from gp_ground_seg.lab import dataset
 
 DESCRIPTION = """\
@@ -93,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         write = partial(dataset.segment_bag, target, used)
     with options.runner(arguments, 'segment') as runner:
         if parameters and (arguments.force or dataset.find_difference(folder, parameters)):
-            write_file(folder / dataset.PARAMETERS, parameters.encode())
+            files.write_file(folder / dataset.PARAMETERS, parameters.encode())
         found = runner.run(write, left)
     _print_summary([*chain(*found)], target, runner.n_workers)
     options.note_spared(config, used)
@@ -105,16 +103,16 @@ def _list_scans(
 ) -> tuple[Inputs, str | None, bool]:
     """Return what to segment, and the format of its files; whether they are one, or one bag."""
     form, suffix = arguments.format, target.suffix[1:]
-    if is_root(source):
+    if semantic_kitti.is_root(source):
         if form not in (None, LABELS):
             raise DataError(f'--format {form}: a KITTI_ROOT gives .label files')
         # Where SemanticKITTI's tools look for predictions.
-        files = [
+        labels = [
             replace(scan, name=f'sequences/{name}/predictions/{scan.name}')
-            for name in list_sequences(source)
+            for name in semantic_kitti.list_sequences(source)
             for scan in options.list_clouds(arguments, source / 'sequences' / name)
         ]
-        return Inputs(source, files), LABELS, False
+        return Inputs(source, labels), LABELS, False
     scans = options.list_clouds(arguments)
     if scans.topic:
         options.refuse(arguments, ('workers', 'scheduler'), 'is for scans, not for a bag')
@@ -131,7 +129,7 @@ def _list_scans(
 def _parameters(arguments: argparse.Namespace, config: Config) -> str:
     """Return what the files of an output folder depend on, beside the content of the inputs."""
     source = Path(arguments.input).resolve()
-    if not (source.is_dir() or holds_bag(source)):
+    if not (source.is_dir() or inputs.holds_bag(source)):
         source = source.parent  # the same names from elsewhere are other inputs
     title = f'written by gp-ground-seg segment {__version__}, from {source}'
     for name in 'topic', 'columns':
@@ -146,7 +144,7 @@ def _default_output(source: Path, form: str | None = None) -> Path:
         return named.with_name(f'{named.name}_ground')
     suffix = '' if named.suffix in ('.bag', '.bin') else named.suffix
     if form is not None:
-        suffix = '' if named.suffix in BAG_SUFFIXES else f'.{form}'
+        suffix = '' if named.suffix in bags.BAG_SUFFIXES else f'.{form}'
     return named.with_name(f'{named.stem}_ground{suffix}')
 
 
