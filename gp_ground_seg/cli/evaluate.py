@@ -25,11 +25,9 @@ from gp_ground_seg.lab.simulation import SCENES, SENSORS
 
 DESCRIPTION = """\
 Segment labelled frames and score the labels in the GroundGrid convention, which leaves
-vegetation out: precision, recall, IoU, heights, time per frame. Count the vehicles, persons and
-cyclists that are lost: of their returns from 0.3 m above the ground more than half are called
-ground. Objects are the instances of the labels (their upper 16 bits). Count low objects, which
-are objects cut at --cut, and false cells, where ground is taken for an obstacle. docs/accuracy.md
-says how. The last line is the result.
+vegetation out: precision, recall, IoU, heights, time per frame. Count vehicles, persons and
+cyclists that are lost, returns on low objects (cut at --cut) called ground, and false cells.
+docs/accuracy.md says what these are. The last line is the result.
 
 With --against a second set of parameters, or with --peer Patchwork++, runs in turns on the same
 frames. Each difference has a bootstrap interval over the sequences, or over blocks of frames of

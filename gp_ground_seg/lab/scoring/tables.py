@@ -268,22 +268,18 @@ def time_tables(
     runs = scans.assign(run=scans.groupby('method').cumcount())
     seconds = runs.pivot(index='run', columns='method', values='seconds')[scores.methods]
     table = seconds.median().to_frame('median').assign(p99=seconds.quantile(0.99))
-    forms = dict[str, Form]()
     if peer:
         table['ratio'] = seconds.div(seconds[peer], axis='index').median()
         table['p99_ratio'] = table['p99'] / table['median'][peer]
-        forms['ratio'] = Form(f'/ {peer}', '.2f')
-        forms['p99_ratio'] = Form(f'p99 / {peer} median', '.2f')
-    names = [name for name in scans if name.startswith(STAGE)]
-    ours = scans[scans[names].notna().any(axis='columns')]
-    stages = ours[names].assign(rest=ours['seconds'] - ours[names].sum(axis='columns'))
-    medians = stages.groupby(ours['method'], sort=False).median()
-    medians = medians.rename(columns=lambda name: name.removeprefix(STAGE))
+    forms = {'ratio': Form(f'/ {peer}', '.2f')}
+    forms['p99_ratio'] = Form(f'p99 / {peer} median', '.2f')
+    stages = scans.filter(regex=f'^{STAGE}').dropna(how='all')  # of ours
+    stages = stages.assign(rest=scans['seconds'] - stages.sum(axis='columns'))
+    stages = stages.rename(columns=lambda name: name.removeprefix(STAGE))
+    medians = stages.groupby(scans['method'], sort=False).median()
     of_stage = {name: Form(name, '.2f', 1e3) for name in medians}
+    of_stage['method'] = Form('stage, median [ms]')
     return {
         'times': Table(title, table.reset_index(), forms),
-        'stages': Table(
-            'Stages of a frame', medians.reset_index(),
-            {**of_stage, 'method': Form('stage, median [ms]')},
-        ),
-    }  # fmt: skip
+        'stages': Table('Stages of a frame', medians.reset_index(), of_stage),
+    }
