@@ -72,11 +72,7 @@ def clusters(scores: Scores) -> DataFrame:
 
 
 def interval_text(
-    scores: Scores,
-    other: str,
-    measure: Measure,
-    frame: DataFrame | None = None,
-    ours: str = '',
+    scores: Scores, other: str, measure: Measure, frame: DataFrame | None = None, ours: str = ''
 ) -> str | None:
     """Interval of a measure of ours, by default the first method, minus that of another.
 
@@ -202,12 +198,7 @@ def evaluation(scores: Scores, config: Config) -> Report:
 
 
 def _grouped(
-    scores: Scores,
-    title: str,
-    frame: DataFrame,
-    by: str,
-    columns: list[str],
-    interval: str = '',
+    scores: Scores, title: str, frame: DataFrame, by: str, columns: list[str], interval: str = ''
 ) -> Table:
     """Lay out measures of the groups of a frame, and of all but for classes of objects.
 
