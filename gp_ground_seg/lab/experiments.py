@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,19 +18,16 @@ from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config, find_preset
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.lab.cluster import HERE, Runner
-from gp_ground_seg.lab.scoring import evaluate, tables
+from gp_ground_seg.lab.scoring import evaluate, report, tables
 from gp_ground_seg.lab.scoring.evaluate import KnownScan, Method, OurMethod, Scores
 from gp_ground_seg.lab.scoring.metrics import ratio
 from gp_ground_seg.lab.scoring.objects import CLASSES, LOW_CLASSES, LOW_HEIGHTS, Objects
 from gp_ground_seg.lab.scoring.peers import INTERPOLATION, InterpolationMethod, PatchworkppMethod
-from gp_ground_seg.lab.scoring.report import COUNT, SIGNED, Form, Report, Table, frame_of
+from gp_ground_seg.lab.scoring.report import DataFrame, Form, Report, Table
 from gp_ground_seg.lab.simulation import LOW, PLACES, SCENES, SENSORS, STEEP, Kind, simulate_scan
 from gp_ground_seg.lab.simulation.objects import object_heights
 from gp_ground_seg.lab.simulation.scenes import DRIVES
 from gp_ground_seg.lab.table1 import table1
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 Changes = Mapping[str, Any]
 """Values of parameters, by dotted name."""
@@ -174,16 +171,15 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     scores, models = score_variants(items, variants, [InterpolationMethod(config)], runner)
     pairs = [(ours, other) for _, _, ours, other in PAIRS]
-    rows = frame_of({
+    rows = report.frame_of({
         'pair': [title for title, *_ in PAIRS],
         'theta': [how for _, how, *_ in PAIRS],
         **_differences(scores, 'iou', pairs, 'iou_'),
         **_differences(scores, 'rmse', pairs, 'rmse_'),
     })  # fmt: skip
-    forms = {
-        'iou_difference': Form('IoU', *SIGNED), 'iou_interval': Form('IoU, 95 % interval'),
-        'rmse_difference': Form('RMSE', *SIGNED), 'rmse_interval': Form('RMSE, 95 % interval'),
-    }  # fmt: skip
+    names = 'IoU', 'RMSE'
+    forms = {f'{name.lower()}_difference': Form(name, *report.SIGNED) for name in names}
+    forms |= {f'{name.lower()}_interval': Form(f'{name}, 95 % interval') for name in names}
     of_pairs = (
         'Differences of IoU [%], where more is better, and of RMSE [cm], where less is; '
         f'{tables.interval_note(scores)}'
@@ -325,7 +321,7 @@ def _scene_table(scores: Scores) -> Table:
         own = evaluate.sums(scores.objects[scores.objects['class'].isin(classes)], 'sequence')
         own = own.reindex(found.index, fill_value=0)
         found = found.assign(**{kind: own['n_objects'], f'lost_{kind}': own['n_lost']})
-        forms |= {kind: Form(kind, *COUNT), f'lost_{kind}': Form('lost', *COUNT)}
+        forms |= {kind: Form(kind, *report.COUNT), f'lost_{kind}': Form('lost', *report.COUNT)}
     table = tables.beside(found, scores).drop(columns='difference')
     title = (
         'IoU of the ground against exact labels [%]; RMSE of the surface [cm]; vehicles, persons '
@@ -344,7 +340,7 @@ def _low_table(scores: Scores) -> Table:
     found = things.join(shares.reindex(columns=[*LOW_CLASSES]))
     title = 'Low objects by height, in plain view 3 to 20 m away, and the share that is lost [%]'
     forms = {name: Form(name.removeprefix('low, '), '.0f', 100.0) for name in LOW_CLASSES}
-    forms['things'] = Form('objects', *COUNT)
+    forms['things'] = Form('objects', *report.COUNT)
     return Table(title + tables.peer_note(scores), _placed(tables.beside(found, scores)), forms)
 
 

@@ -9,7 +9,7 @@ narrow than too wide.
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,10 +17,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.lab.scoring import metrics, objects, report
 from gp_ground_seg.lab.scoring.evaluate import ALL, KEYS, STAGE, Scores, sums
 from gp_ground_seg.lab.scoring.metrics import Measure, ratio, share
-from gp_ground_seg.lab.scoring.report import Form, Report, Table
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from gp_ground_seg.lab.scoring.report import DataFrame, Form, Report, Table
 
 CONFIDENCE, N_DRAWS, SEED = 0.95, 10_000, 0
 N_BLOCKS, MIN_BLOCK = 10, 5
