@@ -12,22 +12,11 @@ from typing import Any
 import numpy as np
 
 import gp_ground_seg.lab.simulation.objects as objects
+import gp_ground_seg.lab.simulation.terrain as landforms
 import gp_ground_seg.lab.simulation.traffic as traffic
 from gp_ground_seg.lab.scoring.objects import LOW_HEIGHTS
 from gp_ground_seg.lab.simulation.objects import Kind, Solid
-from gp_ground_seg.lab.simulation.terrain import (
-    Sum,
-    Terrain,
-    crest,
-    ditch,
-    flat,
-    kerb,
-    polyline,
-    ramp,
-    rough,
-    slope,
-    smooth_then_rough,
-)
+from gp_ground_seg.lab.simulation.terrain import Sum, Terrain, ditch, flat, polyline, ramp, rough
 
 N_SCATTERED, SCATTER_X, SCATTER_Y = 36, (-60.0, 100.0), (6.0, 35.0)
 """Scattered solids, and their distance from the drive [m], which leaves its lane free."""
@@ -99,26 +88,26 @@ _OPEN_COUNTRY: dict[str, Callable[[np.random.Generator], Terrain]] = {
     # Level ground.
     'flat': lambda rng: flat(),
     # Plane that rises or falls by 8 % in a random direction.
-    'slope': lambda rng: slope(0.08, rng.uniform(-math.pi, math.pi)),
+    'slope': lambda rng: landforms.slope(0.08, rng.uniform(-math.pi, math.pi)),
     # Level ground, then at once a climb of 12 %.
     'ramp': lambda rng: ramp(rng.uniform(12.0, 18.0), 0.12, rng.uniform(-0.3, 0.3)),
     # Waves of 2 to 20 m, 8 cm rms.
     'rough': rough,
     # Smooth road that ends in rubble: waves of 0.8 to 6 m, 15 cm rms.
-    'road_then_rubble': lambda rng: smooth_then_rough(rng, rng.uniform(14.0, 20.0), 3.0),
+    'road_then_rubble': lambda rng: landforms.smooth_then_rough(rng, rng.uniform(14.0, 20.0), 3.0),
     # Road between sidewalks 15 cm higher.
-    'kerb': lambda rng: kerb(rng.uniform(3.5, 5.0), 0.15),
+    'kerb': lambda rng: landforms.kerb(rng.uniform(3.5, 5.0), 0.15),
     # Ditch 1 m deep across the drive, at an angle.
     'ditch': lambda rng: ditch(rng.uniform(-0.5, 0.5), rng.uniform(10.0, 14.0), 4.0, 1.5, 1.0),
     # Hill of 8 % slopes with a rounded top that hides what is behind it.
-    'crest': lambda rng: crest(rng.uniform(8.0, 12.0), 15.0, 0.08, 12.0),
+    'crest': lambda rng: landforms.crest(rng.uniform(8.0, 12.0), 15.0, 0.08, 12.0),
 }
 
 
 def _urban(rng: np.random.Generator) -> Parts:
     """Street: kerbs, parked cars, a truck, houses, awnings, poles, trees, a bridge, puddles."""
     road, front = 6.0, 10.0
-    yield (terrain := kerb(road, 0.15))
+    yield (terrain := landforms.kerb(road, 0.15))
     for side in (-1.0, 1.0):
         x = URBAN_X[0]
         while x < URBAN_X[1]:
@@ -187,7 +176,7 @@ class _Line:
 
 def _traffic_jam(rng: np.random.Generator) -> Parts:
     """Five lanes of waiting vehicles between kerbs, cyclists between them, persons who cross."""
-    yield (terrain := kerb(8.2, 0.15))
+    yield (terrain := landforms.kerb(8.2, 0.15))
     with_truck = rng.choice([-1, 1])
     for lane in range(-2, 3):
         line = _Line(terrain, rng, 0.0, 3.2 * lane)
@@ -214,7 +203,7 @@ def _traffic_jam(rng: np.random.Generator) -> Parts:
 
 def _car_park(rng: np.random.Generator) -> Parts:
     """Rows of parked cars, 0.6 to 1 m apart, along aisles 6 m wide with persons in them."""
-    yield (terrain := slope(rng.uniform(0.0, 0.02), rng.uniform(-math.pi, math.pi)))
+    yield (terrain := landforms.slope(rng.uniform(0.0, 0.02), rng.uniform(-math.pi, math.pi)))
     for aside, side in itertools.product((5.5, 10.6, 21.5, 26.6), (-1.0, 1.0)):
         line = _Line(terrain, rng, 0.0, side * aside)
         turned = rng.choice([-1.0, 1.0]) * math.pi / 2.0
