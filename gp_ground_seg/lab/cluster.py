@@ -62,7 +62,7 @@ class Runner:
         """
         if self.client is None:
             return [function(items, partial(self.bar, total=len(items)))]
-        from distributed import as_completed
+        from distributed import KilledWorker, as_completed
 
         blocks = cut(items, group, self.n_workers)
         compute = partial(_compute_block, __version__, function)
@@ -70,26 +70,20 @@ class Runner:
         block_of, found = dict(zip(futures, blocks, strict=True)), {}
         with self.bar(total=len(items)) as bar:
             for future in as_completed(futures, loop=self.client.loop):
-                found[future], notes = _result_of(future, block_of[future])
+                block = block_of[future]
+                try:
+                    found[future], notes = future.result()
+                except CancelledError as error:
+                    raise DataError('the scheduler is lost') from error
+                except KilledWorker as error:
+                    raise DataError(
+                        f'{block[0]} to {block[-1]}: each worker that computed this block died, '
+                        'as where memory is short: fewer workers have more of it each'
+                    ) from error
                 for note in notes:
                     errors.log_once(*note)
-                bar.update(len(block_of[future]))
+                bar.update(len(block))
         return [found[future] for future in futures]
-
-
-def _result_of(future: Any, block: Sequence[Any]) -> Any:
-    """Return what `_compute_block` did; DataError if workers or the scheduler died."""
-    from distributed import KilledWorker
-
-    try:
-        return future.result()
-    except CancelledError as error:
-        raise DataError('the scheduler is lost') from error
-    except KilledWorker as error:
-        raise DataError(
-            f'{block[0]} to {block[-1]}: each worker that computed this block died, as where '
-            'memory is short: fewer workers have more of it each'
-        ) from error
 
 
 HERE = Runner()
@@ -130,7 +124,13 @@ def open_runner(
     Raises DataError if the scheduler does not answer, MissingDependencyError without distributed.
     """
     if scheduler is not None:
-        with _connect(scheduler) as client:
+        distributed = _quiet_distributed()
+        try:  # with the keys of Dask's configuration
+            client = distributed.Client(scheduler, set_as_default=False, timeout=CONNECT_TIMEOUT)
+        except (OSError, ValueError, TypeError, MemoryError) as error:  # memory: no Dask is there
+            said = f'does not answer ({errors.in_one_line(error)})'
+            raise DataError(f'--scheduler {scheduler}: {said}') from error
+        with client:
             errors.LOGGER.info('dashboard: %s', client.dashboard_link)
             n_workers = sum(client.nthreads().values())
             if not n_workers:
@@ -203,13 +203,3 @@ def _ctrl_c_kept() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _connect(address: str) -> Any:
-    """Connect to a scheduler, with the keys of Dask's configuration."""
-    distributed = _quiet_distributed()
-    try:
-        return distributed.Client(address, set_as_default=False, timeout=CONNECT_TIMEOUT)
-    except (OSError, ValueError, TypeError, MemoryError) as error:  # memory: no Dask speaks there
-        text = f'--scheduler {address}: does not answer ({errors.in_one_line(error)})'
-        raise DataError(text) from error

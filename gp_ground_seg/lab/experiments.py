@@ -265,7 +265,11 @@ def measure_speed(items: Sequence[Frame], config: Config, runner: Runner = HERE)
         for name, mode in MODES.items()
     ]
     methods.insert(len(MODES), PatchworkppMethod.of_sensor(config.sensor))
-    scores = evaluate.score_methods([*items] * N_PASSES, methods, _points_of, runner=runner)
+    scores = evaluate.score_methods(
+        [*items] * N_PASSES, methods,
+        # The points alone: what is not scored leaves the caches as they are.
+        lambda frame: KnownScan(frame.sequence, frame.index, frame.points), runner=runner,
+    )  # fmt: skip
     points = scores.scans['points']
     title = (
         f'Time per frame: {len(items)} frames, {N_PASSES} passes, reading left out; '
@@ -273,11 +277,6 @@ def measure_speed(items: Sequence[Frame], config: Config, runner: Runner = HERE)
     )
     times = tables.time_tables(scores, evaluate.PATCHWORKPP, title)
     return tables.make_report(times, scores, config)
-
-
-def _points_of(frame: Frame) -> KnownScan:
-    """Read the points alone: what is not scored leaves the caches as they are."""
-    return KnownScan(frame.sequence, frame.index, frame.points)
 
 
 # Simulated scenes: ours beside Patchwork++, and objects lost.
