@@ -18,7 +18,6 @@ EXAMPLES = """\
   gp-ground-seg config check my.yaml         unknown names, types, ranges
 """
 DUMP = 'print the effective parameters as a ROS parameter file'
-CHECK = 'say everything that is wrong with a parameter file'
 CHECK_DESCRIPTION = """\
 Check names, types, ranges and the rules between parameters, and say who reads the
 file: commands read bare groups too, the node only the form of ROS (/**:
@@ -34,8 +33,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.command(commands, 'dump', DUMP, EXAMPLES, *options.CONFIG, purpose=DUMP, run=run_dump)
     files = 'files', 'parameter file (YAML)', {'metavar': 'FILE', 'nargs': '+'}
     options.command(
-        commands, 'check', CHECK_DESCRIPTION, EXAMPLES, files, purpose=CHECK, run=run_check
-    )
+        commands, 'check', CHECK_DESCRIPTION, EXAMPLES, files,
+        purpose='say everything that is wrong with a parameter file', run=run_check,
+    )  # fmt: skip
 
 
 def run_dump(arguments: argparse.Namespace) -> int:

@@ -56,7 +56,6 @@ EXPERIMENT_EXAMPLES = """\
   gp-ground-seg experiment NAME --help   describes one of them
 """
 
-PEER = 'pypatchworkpp'
 ROOT = ('root', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'})
 OF_FRAMES = (
     ('--sequences', 'sequences, as in 00,08 (default: all)', {'metavar': 'LIST'}),
@@ -181,7 +180,7 @@ def print_report(
     arguments: argparse.Namespace, found: report.Report, runner: Runner, **facts: Any
 ) -> None:
     """Write ``--json`` with `facts`, and print the tables."""
-    environment = {**report.describe_environment(PEER), 'n_workers': runner.n_workers}
+    environment = {**report.describe_environment('pypatchworkpp'), 'n_workers': runner.n_workers}
     if arguments.json:
         data = found.encode(environment, **facts)
         files.write_file(Path(arguments.json), data, force=arguments.force)

@@ -136,8 +136,8 @@ _VALUES = ('height', 'ground_z', 'ground_std', 'p_ground')
 def read_file(path: Path, columns: int = KITTI_COLUMNS) -> Cloud:
     """Read a file; `columns` are the numbers of a point in a ``.bin``.
 
-    Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, or can be no scan.
-    nuScenes' ``.pcd.bin`` is known by its name.
+    Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
+    points, or can be no scan. nuScenes' ``.pcd.bin`` is known by its name.
     """
     data, is_bin = read_bytes(path, MAX_SCAN_BYTES), path.suffix.lower() == '.bin'
     if path.name.endswith(NUSCENES_SUFFIX) and columns == KITTI_COLUMNS:

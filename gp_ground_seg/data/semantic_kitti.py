@@ -149,11 +149,7 @@ def _read_times(path: Path, frames: Sequence[Path]) -> list[float]:
 
 
 def read_points(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[np.float32]:
-    """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4).
-
-    Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
-    points, or can be no scan.
-    """
+    """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4); DataError as `read_file`."""
     return read_file(Path(path), columns).xyz.astype(np.float32, copy=False)
 
 

@@ -167,7 +167,11 @@ def _start_workers(n_workers: int) -> Iterator[Any]:
         'distributed.nanny.pre-spawn-environ': {},
     }
     with dask.config.set(settings):
-        with _ctrl_c_kept():
+        # Ctrl-C, which all processes of a terminal get, is kept from those of threads started
+        # here, which inherit the mask of signals; in this process it takes effect behind them.
+        resource_tracker.ensure_running()  # its start would change the mask
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
             cluster = distributed.LocalCluster(
                 n_workers=0,  # they start below: Ctrl-C does not wait for them
                 threads_per_worker=1,
@@ -178,6 +182,8 @@ def _start_workers(n_workers: int) -> Iterator[Any]:
                 silence_logs=logging.CRITICAL,
             )
             client = distributed.Client(cluster, set_as_default=False)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         with cluster, client:
             try:
                 cluster.scale(n_workers)
@@ -189,17 +195,3 @@ def _start_workers(n_workers: int) -> Iterator[Any]:
                 for process in {*multiprocessing.active_children()} - {*others}:
                     process.kill()
                 raise
-
-
-@contextmanager
-def _ctrl_c_kept() -> Iterator[None]:
-    """Keep Ctrl-C, which all processes of a terminal get, from those of threads started here.
-
-    They inherit the mask of signals. In this process it takes effect behind the block.
-    """
-    resource_tracker.ensure_running()  # its start would change the mask
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
