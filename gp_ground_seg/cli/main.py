@@ -134,18 +134,6 @@ def _abandon_stdout() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _run(words: list[str]) -> int:
-    """Run the command; raise what it raises, or what standard output does at its end."""
-    try:
-        with _interruptible():
-            arguments = _parse(words)
-            with _notes(arguments):
-                code: int = arguments.run(arguments)
-    finally:
-        print(end='', flush=True)  # also after --help, which ends by SystemExit
-    return code
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command of `argv`, by default of the process, and return its exit code.
 
@@ -155,7 +143,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors='backslashreplace')  # names of files need not be UTF-8
     try:
-        return _run(list(sys.argv[1:] if argv is None else argv))
+        try:
+            with _interruptible():
+                arguments = _parse(list(sys.argv[1:] if argv is None else argv))
+                with _notes(arguments):
+                    code: int = arguments.run(arguments)
+        finally:
+            print(end='', flush=True)  # also after --help, which ends by SystemExit
+        return code
     except BrokenPipeError:  # the reader of our output went away, as `| head` does
         _abandon_stdout()
         return 0
