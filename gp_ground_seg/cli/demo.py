@@ -26,16 +26,11 @@ from gp_ground_seg.ros.session import Session, needing_ros
 BAG, PICTURE, LOG = 'drive.mcap', 'scan.png', 'node.log'
 TOPIC = '/points'  # of the bag
 FRAME_ID = 'lidar'
-EPOCH = 1_700_000_000
-"""Second at which every drive starts: the same drive gives the same bag."""
-SEED, SPEED = 3, 8.0
-"""Seed and speed [m/s] of the simulated drive."""
-LABELS = {GROUND: Label.GROUND, OBSTACLES: Label.OBSTACLE}
-"""Label of the points on each topic."""
-PERIOD = 0.1
-"""Time of a turn of the sensor; scans are sent no faster [s]."""
-LAST_LINES = 20
-"""Of the node's log, printed when the demo fails."""
+EPOCH = 1_700_000_000  # second at which every drive starts: the same drive gives the same bag
+SEED, SPEED = 3, 8.0  # seed and speed [m/s] of the simulated drive
+LABELS = {GROUND: Label.GROUND, OBSTACLES: Label.OBSTACLE}  # label of the points on each topic
+PERIOD = 0.1  # time of a turn of the sensor; scans are sent no faster [s]
+LAST_LINES = 20  # of the node's log, printed when the demo fails
 
 DESCRIPTION = f"""\
 Show the node at work without data: simulate a short drive along a street, write it as a bag,

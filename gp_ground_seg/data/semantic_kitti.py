@@ -14,8 +14,7 @@ from gp_ground_seg.core.frame import BoolArray
 from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, read_file
 from gp_ground_seg.data.files import naming, read_bytes
 
-UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70
-"""Classes that are neither ground nor obstacle."""
+UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70  # classes that are neither ground nor obstacle
 GROUND_CLASSES = (40, 44, 48, 49, 60, 72)
 """Road, parking, sidewalk, other ground, lane marking, terrain."""
 FRAME_PERIOD = 0.1  # time between frames [s] where a sequence has no times.txt

@@ -27,10 +27,8 @@ LOW_DISTANCE, LOW_GAP = (3.0, 20.0), 0.03
 """Distance of the nearest corner of a low object [m], and angle between neighbours [rad]."""
 N_OF_EACH, APART = 4, 5.5
 """Cars, persons, crates, poles and walls around a vehicle, and least distance of two [m]."""
-CRATES = 0.4, 0.65
-"""Heights of the crates that are objects [m]."""
-ENDS = -15.0, -8.0, 8.0, 15.0
-"""Places of persons and crates along a valley or a dike [m]."""
+CRATES = 0.4, 0.65  # heights of the crates that are objects [m]
+ENDS = -15.0, -8.0, 8.0, 15.0  # places of persons and crates along a valley or a dike [m]
 LEANING = 'hills', 'on_ramp'  # scenes in which the vehicle leans with the ground
 BANKS = tuple(np.radians((15.0, 25.0, 35.0)).tolist())  # slopes of banks [rad]
 URBAN_X = (-80.0, 160.0)  # where the street of the urban scene begins and ends [m]
@@ -58,8 +56,7 @@ class Scene:
     leans: bool = False  # whether the vehicle leans with the ground under it, or is level
 
 
-Parts = Iterator[Any]
-"""The terrain of a scene, then the solids on it and its wet patches."""
+Parts = Iterator[Any]  # the terrain of a scene, then the solids on it and its wet patches
 
 
 def _open(make: Callable[[np.random.Generator], Terrain], rng: np.random.Generator) -> Parts:
@@ -423,5 +420,4 @@ PLACES = {
     **LOW, **STEEP,
 }  # fmt: skip
 """All scenes around a sensor at the origin."""
-SCENES = {**DRIVES, **PLACES}
-"""All scenes by name."""
+SCENES = {**DRIVES, **PLACES}  # all scenes by name
