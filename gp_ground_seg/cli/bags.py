@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -12,16 +13,11 @@ import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
-from gp_ground_seg.data.bags import (
-    POINT_CLOUD2,
-    BagReader,
-    cloud_from_columns,
-    encode_cloud,
-    new_bag,
-)
+from gp_ground_seg.data import bags
+from gp_ground_seg.data.bags import POINT_CLOUD2, BagReader
 from gp_ground_seg.data.point_cloud2 import CloudMessage
 from gp_ground_seg.data.semantic_kitti import list_frames
-from gp_ground_seg.ros.session import Session, large_cloud_transport, needing_ros, ros_session
+from gp_ground_seg.ros.session import large_cloud_transport, needing_ros, ros_session
 
 TOPIC = '/kitti/velo/pointcloud'
 FRAME_ID = 'velo_link'
@@ -67,29 +63,25 @@ PLAY_EXAMPLES = """\
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
-    parser = options.new_parser(subparsers, 'kitti-to-bag', CONVERT_DESCRIPTION, CONVERT_EXAMPLES)
-    options.add(
-        parser,
+    options.command(
+        subparsers, 'kitti-to-bag', CONVERT_DESCRIPTION, CONVERT_EXAMPLES,
         ('root', 'folder with sequences/ in it', {'metavar': 'ROOT'}),
         ('output', 'folder, .mcap or .db3 file to write', {'metavar': 'OUT'}),
         ('--sequence', 'sequence, as in 00', {'metavar': 'S', 'required': True}),
         options.COLUMNS,
         options.FORCE,
-        options.QUIET,
-    )
-    parser.set_defaults(run=run_convert)
-
-    parser = options.new_parser(subparsers, 'play', PLAY_DESCRIPTION, PLAY_EXAMPLES)
-    options.add(
-        parser,
+        options.QUIET, run=run_convert,
+    )  # fmt: skip
+    options.command(
+        subparsers, 'play', PLAY_DESCRIPTION, PLAY_EXAMPLES,
         ('bag', 'bag to play', {'metavar': 'BAG'}),
         ('--rate', 'speed, 2 = twice as fast as recorded (default: 1)',
-         {'metavar': 'R', 'type': options.above_zero, 'default': 1.0}),
+         {'metavar': 'R', 'default': 1.0,
+          'type': options.value(float, lambda rate: 0 < rate < math.inf, 'a number, above 0')}),
         ('--loop', 'begin again at the end, until Ctrl-C', options.FLAG),
         ('--clock', "publish the bag's time on /clock, 50 Hz (for use_sim_time)", options.FLAG),
-        options.QUIET,
+        options.QUIET, run=run_play, accepts_ros_args=True,
     )  # fmt: skip
-    parser.set_defaults(run=run_play, accepts_ros_args=True)
 
 
 def scan_cloud(
@@ -97,7 +89,7 @@ def scan_cloud(
 ) -> CloudMessage:
     """Return points (N, 4), x y z [m] intensity, and `further` fields (N,) as a cloud."""
     columns = {name: points[:, k] for k, name in enumerate(('x', 'y', 'z', 'intensity'))}
-    return cloud_from_columns(divmod(stamp_ns, 10**9), frame_id, {**columns, **further})
+    return bags.cloud_from_columns(divmod(stamp_ns, 10**9), frame_id, {**columns, **further})
 
 
 def run_convert(arguments: argparse.Namespace) -> int:
@@ -109,12 +101,12 @@ def run_convert(arguments: argparse.Namespace) -> int:
         raise DataError(f'times.txt of sequence {arguments.sequence}: {times}: no stamps of ROS')
     n_points = n_labelled = 0
     progress = options.progress('kitti-to-bag', quiet=arguments.quiet)
-    with new_bag(arguments.output, {TOPIC: POINT_CLOUD2}, force=arguments.force) as write:
+    with bags.new_bag(arguments.output, {TOPIC: POINT_CLOUD2}, force=arguments.force) as write:
         for frame, stamp in progress([*zip(frames, stamps, strict=True)]):
             points, labels = frame.points, {}
             if frame.labels_path is not None:
                 labels['label'] = frame.semantic.astype(np.uint32)
-            write(TOPIC, stamp, encode_cloud(scan_cloud(points, stamp, FRAME_ID, **labels)))
+            write(TOPIC, stamp, bags.encode_cloud(scan_cloud(points, stamp, FRAME_ID, **labels)))
             n_points += len(points)
             n_labelled += len(labels)
     n_frames, n_all = options.count(len(frames), 'frame'), options.count(n_points, 'point')
@@ -136,48 +128,40 @@ def run_play(arguments: argparse.Namespace) -> int:
             ros_session('bag_player', arguments.ros_args) as session,
             options.progress('play', quiet=arguments.quiet)(total=total) as bar,
         ):
-            player = Player(session, topics, arguments.rate, has_clock=arguments.clock)
-            player.play(bag, bar.update)
-            while arguments.loop:
-                player.play(bag, bar.update)
+            publishers = {t: session.publisher_of_clouds(t, DEPTH) for t in topics}
+            tell_time = session.publisher_of_time() if arguments.clock else lambda _time: None
+            n_subscribed = [publisher.get_subscription_count for publisher in publishers.values()]
+            session.wait_for(lambda: all(n() for n in n_subscribed), DISCOVERY_TIMEOUT)
+            for topic, due, recorded, raw in _scheduled(
+                bag, topics, arguments.rate, arguments.loop
+            ):
+                left = math.inf
+                while left:
+                    left = max(0.0, due - time.monotonic())
+                    tell_time(recorded - round(1e9 * left * arguments.rate))
+                    session.sleep(min(SLICE, left))
+                publishers[topic].publish(raw)
+                bar.update()
             # With the publisher the last clouds would be lost.
-            for publisher in player.publishers.values():
+            for publisher in publishers.values():
                 session.wait_until_delivered(publisher, DELIVERY_TIMEOUT)
     return 0
 
 
-class Player:
-    """Publishes the clouds of `topics`, `rate` times as fast as they were recorded."""
-
-    def __init__(
-        self, session: Session, topics: list[str], rate: float, *, has_clock: bool
-    ) -> None:
-        self._session, self._rate, self._start = session, rate, 0.0
-        self.publishers = {t: session.publisher_of_clouds(t, DEPTH) for t in topics}
-        self._tell_time = session.publisher_of_time() if has_clock else None
-        counts = [publisher.get_subscription_count for publisher in self.publishers.values()]
-        session.wait_for(lambda: all(count() for count in counts), DISCOVERY_TIMEOUT)
-
-    def play(self, bag: BagReader, on_cloud: Callable[[], object]) -> None:
-        """Play the bag, a pause after the last round."""
+def _scheduled(
+    bag: BagReader, topics: list[str], rate: float, is_loop: bool
+) -> Iterator[tuple[str, float, int, bytes]]:
+    """Yield topic, monotonic time when it is due [s], time in the bag [ns], bytes of clouds."""
+    start = 0.0
+    while True:
         first: int | None = None
         elapsed = 0  # in the bag [ns]
-        for topic, recorded, raw in bag.messages(self.publishers):
+        for topic, recorded, raw in bag.messages(topics):
             if first is None:
-                first, self._start = recorded, max(self._start, time.monotonic())
+                first, start = recorded, max(start, time.monotonic())
             # The parts of a split bag may overlap.
             elapsed = max(elapsed, recorded - first)
-            self._wait_until(self._start + 1e-9 * elapsed / self._rate, first + elapsed)
-            self.publishers[topic].publish(raw)
-            on_cloud()
-        self._start += (1e-9 * elapsed + PAUSE) / self._rate
-
-    def _wait_until(self, due: float, recorded: int) -> None:
-        """Wait until a monotonic time [s]; at it, the time of the bag is `recorded` [ns]."""
-        while True:
-            left = max(0.0, due - time.monotonic())
-            if self._tell_time is not None:
-                self._tell_time(recorded - round(1e9 * left * self._rate))
-            self._session.sleep(min(SLICE, left))
-            if not left:
-                return
+            yield topic, start + 1e-9 * elapsed / rate, first + elapsed, raw
+        if not is_loop:
+            return
+        start += (1e-9 * elapsed + PAUSE) / rate

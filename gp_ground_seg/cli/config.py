@@ -18,7 +18,6 @@ EXAMPLES = """\
   gp-ground-seg config check my.yaml         unknown names, types, ranges
 """
 DUMP = 'print the effective parameters as a ROS parameter file'
-CHECK = 'say everything that is wrong with a parameter file'
 CHECK_DESCRIPTION = """\
 Check names, types, ranges and the rules between parameters, and say who reads the
 file: commands read bare groups too, the node only the form of ROS (/**:
@@ -29,14 +28,14 @@ ros__parameters:). Exit code 2 if anything is wrong.
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and its subcommands."""
     description = 'Show the parameters, their units and ranges.'
-    parser = options.new_parser(subparsers, 'config', description, EXAMPLES)
+    parser = options.command(subparsers, 'config', description, EXAMPLES)
     commands = parser.add_subparsers(metavar='WHAT', required=True)
-    parser = options.new_parser(commands, 'dump', DUMP, EXAMPLES, DUMP)
-    options.add_config(parser)
-    parser.set_defaults(run=run_dump)
-    parser = options.new_parser(commands, 'check', CHECK_DESCRIPTION, EXAMPLES, CHECK)
-    parser.add_argument('files', metavar='FILE', nargs='+', help='parameter file (YAML)')
-    parser.set_defaults(run=run_check)
+    options.command(commands, 'dump', DUMP, EXAMPLES, *options.CONFIG, purpose=DUMP, run=run_dump)
+    files = 'files', 'parameter file (YAML)', {'metavar': 'FILE', 'nargs': '+'}
+    options.command(
+        commands, 'check', CHECK_DESCRIPTION, EXAMPLES, files,
+        purpose='say everything that is wrong with a parameter file', run=run_check,
+    )  # fmt: skip
 
 
 def run_dump(arguments: argparse.Namespace) -> int:

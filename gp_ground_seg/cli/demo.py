@@ -26,16 +26,11 @@ from gp_ground_seg.ros.session import Session, needing_ros
 BAG, PICTURE, LOG = 'drive.mcap', 'scan.png', 'node.log'
 TOPIC = '/points'  # of the bag
 FRAME_ID = 'lidar'
-EPOCH = 1_700_000_000
-"""Second at which every drive starts: the same drive gives the same bag."""
-SEED, SPEED = 3, 8.0
-"""Seed and speed [m/s] of the simulated drive."""
-LABELS = {GROUND: Label.GROUND, OBSTACLES: Label.OBSTACLE}
-"""Label of the points on each topic."""
-PERIOD = 0.1
-"""Time of a turn of the sensor; scans are sent no faster [s]."""
-LAST_LINES = 20
-"""Of the node's log, printed when the demo fails."""
+EPOCH = 1_700_000_000  # second at which every drive starts: the same drive gives the same bag
+SEED, SPEED = 3, 8.0  # seed and speed [m/s] of the simulated drive
+LABELS = {GROUND: Label.GROUND, OBSTACLES: Label.OBSTACLE}  # label of the points on each topic
+PERIOD = 0.1  # time of a turn of the sensor; scans are sent no faster [s]
+LAST_LINES = 20  # of the node's log, printed when the demo fails
 
 DESCRIPTION = f"""\
 Show the node at work without data: simulate a short drive along a street, write it as a bag,
@@ -58,15 +53,13 @@ exit code: 0, 1 if points were lost, 2 for an error, 130 when interrupted
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = options.new_parser(subparsers, 'demo', DESCRIPTION, EXAMPLES)
-    options.add(
-        parser,
+    options.command(
+        subparsers, 'demo', DESCRIPTION, EXAMPLES,
         ('--frames', 'scans to play (default: %(default)s)', {**options.NUMBER, 'default': 30}),
         ('--output', 'folder for what is written (default: %(default)s)',
          {'metavar': 'DIR', 'default': 'demo_output'}),
-        options.FORCE,
+        options.FORCE, run=run,
     )  # fmt: skip
-    parser.set_defaults(run=run)
 
 
 class Tally:

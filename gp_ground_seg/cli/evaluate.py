@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
@@ -14,37 +15,19 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import ConfigError, DataError, require, shown
 from gp_ground_seg.core.parameters.config import config_of
 from gp_ground_seg.core.parameters.schema import yaml_scalar
-from gp_ground_seg.data.files import check_writable, write_file
-from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.data.semantic_kitti import Frame, is_root, labelled_frames
+from gp_ground_seg.data import files, inputs, semantic_kitti
 from gp_ground_seg.lab.cluster import Runner
 from gp_ground_seg.lab.experiments import EXPERIMENTS, simulated_frames
-from gp_ground_seg.lab.scoring import tables
-from gp_ground_seg.lab.scoring.evaluate import (
-    KnownScan,
-    Method,
-    OurMethod,
-    Scores,
-    load_kitti,
-    score_methods,
-)
+from gp_ground_seg.lab.scoring import evaluate, report, tables
 from gp_ground_seg.lab.scoring.objects import CUT_HEIGHT
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
-from gp_ground_seg.lab.scoring.report import (
-    Report,
-    changed_parameters,
-    describe_environment,
-    machine_line,
-)
 from gp_ground_seg.lab.simulation import SCENES, SENSORS
 
 DESCRIPTION = """\
 Segment labelled frames and score the labels in the GroundGrid convention, which leaves
-vegetation out: precision, recall, IoU, heights, time per frame. Count the vehicles, persons and
-cyclists that are lost: of their returns from 0.3 m above the ground more than half are called
-ground. Objects are the instances of the labels (their upper 16 bits). Count low objects, which
-are objects cut at --cut, and false cells, where ground is taken for an obstacle. docs/accuracy.md
-says how. The last line is the result.
+vegetation out: precision, recall, IoU, heights, time per frame. Count vehicles, persons and
+cyclists that are lost, returns on low objects (cut at --cut) called ground, and false cells.
+docs/accuracy.md says what these are. The last line is the result.
 
 With --against a second set of parameters, or with --peer Patchwork++, runs in turns on the same
 frames. Each difference has a bootstrap interval over the sequences, or over blocks of frames of
@@ -73,67 +56,62 @@ EXPERIMENT_EXAMPLES = """\
   gp-ground-seg experiment NAME --help   describes one of them
 """
 
-PEER = 'pypatchworkpp'
 ROOT = ('root', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'})
 OF_FRAMES = (
     ('--sequences', 'sequences, as in 00,08 (default: all)', {'metavar': 'LIST'}),
     ('--frame-step', 'every Nth frame of a sequence only', options.NUMBER),
     options.COLUMNS,
 )
+REPORT = options.MARKDOWN, options.TO_JSON, options.FORCE
 CUT = (
     '--cut',
     f'height [m] at which objects are cut, to count low objects (default: {CUT_HEIGHT}); '
     '0 = no low objects: each method segments a frame once',
-    {'metavar': 'HEIGHT', 'type': partial(options.above_zero, or_zero=True)},
-)
+    {'metavar': 'HEIGHT',
+     'type': options.value(float, lambda z: 0.0 <= z < math.inf, 'a number, at least 0')},
+)  # fmt: skip
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
-    parser = options.new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
     peer = 'compare with this method: patchworkpp (pip install pypatchworkpp)'
-    options.add(parser, ROOT, *OF_FRAMES, CUT)
-    options.add(
-        parser.add_mutually_exclusive_group(),
-        ('--against', 'compare with this parameter file or preset', {'metavar': 'NAME'}),
-        ('--peer', peer, {'choices': ['patchworkpp'], 'metavar': 'METHOD'}),
-    )
-    options.add(parser, options.MARKDOWN, options.TO_JSON, options.FORCE)
-    options.add_cluster(parser)
-    options.add_config(parser)
-    parser.set_defaults(run=run_evaluate)
+    options.command(
+        subparsers, 'evaluate', DESCRIPTION, EXAMPLES, ROOT, *OF_FRAMES, CUT,
+        [('--against', 'compare with this parameter file or preset', {'metavar': 'NAME'}),
+         ('--peer', peer, {'choices': ['patchworkpp'], 'metavar': 'METHOD'})],
+        *REPORT, options.CLUSTER, *options.CONFIG, run=run_evaluate,
+    )  # fmt: skip
     _add_experiments(subparsers)
 
 
 def _add_experiments(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare `experiment`, and a command below it for each of `EXPERIMENTS`."""
     description = 'Repeat an experiment of docs/: configurations scored over scans.'
-    parser = options.new_parser(subparsers, 'experiment', description, EXPERIMENT_EXAMPLES)
+    parser = options.command(subparsers, 'experiment', description, EXPERIMENT_EXAMPLES)
     names = parser.add_subparsers(metavar='NAME', required=True, dest='experiment')
     for name, experiment in EXPERIMENTS.items():
         description = inspect.getdoc(experiment.run) or name
         source = ' KITTI_ROOT' if experiment.labelled else ' --sensors vlp-16'
         example = f'  gp-ground-seg experiment {name}{source} --json {name}.json'
-        purpose = description.splitlines()[0].removesuffix('.')
-        child = options.new_parser(names, name, f'{description}\n', example, purpose)
-        child.set_defaults(run=run_experiment, root=None, workers=None, scheduler=None)
+        given: list[Any] = []
         if experiment.labelled:
             count = {'nargs': '?'} if experiment.sensors else {}
-            options.add(child, (*ROOT[:2], {**ROOT[2], **count}), *OF_FRAMES)
+            given += (*ROOT[:2], {**ROOT[2], **count}), *OF_FRAMES
         if experiment.sensors:
             n_seeds = f'scenes of each kind (default: {experiment.n_seeds})'
-            options.add(child, ('--seeds', n_seeds, options.NUMBER))
+            given += [('--seeds', n_seeds, options.NUMBER)]
             for option, known, default in (
                 ('--sensors', SENSORS, experiment.sensors),
                 ('--scenes', SCENES, experiment.scenes),
             ):
                 text = f'some of {", ".join(known)} (default: {", ".join(default)})'
-                kind = {'metavar': 'LIST', 'type': options.some_of(known)}
-                options.add(child, (option, text, kind))
-        options.add(child, options.MARKDOWN, options.TO_JSON, options.FORCE)
-        if not experiment.is_timed:
-            options.add_cluster(child)
-        options.add_config(child)
+                given += [(option, text, {'metavar': 'LIST', 'type': options.some_of(known)})]
+        given += *REPORT, *([] if experiment.is_timed else [options.CLUSTER]), *options.CONFIG
+        options.command(
+            names, name, f'{description}\n', example, *given, run=run_experiment,
+            purpose=description.splitlines()[0].removesuffix('.'),
+            root=None, workers=None, scheduler=None,
+        )  # fmt: skip
 
 
 def run_evaluate(arguments: argparse.Namespace) -> int:
@@ -141,12 +119,12 @@ def run_evaluate(arguments: argparse.Namespace) -> int:
     config = options.read_config(arguments)
     cut = CUT_HEIGHT if arguments.cut is None else float(arguments.cut)
     changed: list[str] = []
-    methods: list[Method] = [OurMethod(config)]
+    methods: list[evaluate.Method] = [evaluate.OurMethod(config)]
     if arguments.peer is not None:
         methods.append(PatchworkppMethod.of_sensor(config.sensor))
     if arguments.against is not None:
         other = config_of(arguments.against)
-        methods.append(OurMethod(other, shown(Path(arguments.against).name)))
+        methods.append(evaluate.OurMethod(other, shown(Path(arguments.against).name)))
         changed = [
             f'{spec.name}: {yaml_scalar(before)} -> {yaml_scalar(after)} {spec.unit}'.rstrip()
             for spec, before, after in other.differences(config)
@@ -155,12 +133,12 @@ def run_evaluate(arguments: argparse.Namespace) -> int:
             raise ConfigError(f'--against {arguments.against}: the same parameters as given')
     items, load = _items(arguments, cut)
     with reporting_runner(arguments, 'evaluate') as runner:
-        scores = score_methods(items, methods, load, runner=runner)
+        scores = evaluate.score_methods(items, methods, load, runner=runner)
     if changed:
         print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
-    report = tables.evaluation(scores, config)
-    print_report(arguments, report, runner, data=arguments.root, cut=cut)
-    changes = [f'{name}={value}' for name, value in changed_parameters(config).items()]
+    found = tables.evaluation(scores, config)
+    print_report(arguments, found, runner, data=arguments.root, cut=cut)
+    changes = [f'{name}={value}' for name, value in report.changed_parameters(config).items()]
     print('', f'parameters: {", ".join(changes) or "defaults"}', *_result_lines(scores), sep='\n')
     return 0
 
@@ -184,8 +162,8 @@ def run_experiment(arguments: argparse.Namespace) -> int:
         else frames_from_options(arguments)
     )
     with reporting_runner(arguments, name) as runner:
-        report = experiment.run(scans, config, runner)
-    print_report(arguments, report, runner, experiment=name)
+        found = experiment.run(scans, config, runner)
+    print_report(arguments, found, runner, experiment=name)
     return 0
 
 
@@ -194,27 +172,27 @@ def reporting_runner(arguments: argparse.Namespace, title: str) -> AbstractConte
     if arguments.markdown:
         require('tabulate', 'tabulate')
     if arguments.json:
-        check_writable(arguments.json, force=arguments.force)
+        files.check_writable(arguments.json, force=arguments.force)
     return options.runner(arguments, title)
 
 
 def print_report(
-    arguments: argparse.Namespace, report: Report, runner: Runner, **facts: Any
+    arguments: argparse.Namespace, found: report.Report, runner: Runner, **facts: Any
 ) -> None:
     """Write ``--json`` with `facts`, and print the tables."""
-    environment = {**describe_environment(PEER), 'n_workers': runner.n_workers}
+    environment = {**report.describe_environment('pypatchworkpp'), 'n_workers': runner.n_workers}
     if arguments.json:
-        data = report.encode(environment, **facts)
-        write_file(Path(arguments.json), data, force=arguments.force)
-    machine = machine_line(environment, report.backend)
-    print(report.text(machine, markdown=arguments.markdown))
+        data = found.encode(environment, **facts)
+        files.write_file(Path(arguments.json), data, force=arguments.force)
+    machine = report.machine_line(environment, found.backend)
+    print(found.text(machine, markdown=arguments.markdown))
 
 
-def _items(arguments: argparse.Namespace, cut: float) -> tuple[Any, Callable[[Any], KnownScan]]:
+def _items(arguments: argparse.Namespace, cut: float) -> tuple[Any, Callable[[Any], Any]]:
     """Return labelled frames, or with ``--against`` any clouds, and the reader of a cloud."""
     root = Path(arguments.root)
-    if is_root(root):
-        return frames_from_options(arguments), partial(load_kitti, cut=cut)
+    if semantic_kitti.is_root(root):
+        return frames_from_options(arguments), partial(evaluate.load_kitti, cut=cut)
     if not root.exists():
         raise DataError(f'{root}: no such file or folder')
     if arguments.against is None:
@@ -224,12 +202,12 @@ def _items(arguments: argparse.Namespace, cut: float) -> tuple[Any, Callable[[An
         )
     names = ('sequences', 'frame_step', 'cut', 'workers', 'scheduler')
     options.refuse(arguments, names, f'{root} has no sequences/*/velodyne below it')
-    inputs = list_inputs(root, options.columns_of(arguments))
-    name = shown(inputs.path.stem)
-    return inputs, lambda item: KnownScan(name, shown(item.name), item.read().xyz)
+    found = inputs.list_inputs(root, options.columns_of(arguments))
+    name = shown(found.path.stem)
+    return found, lambda item: evaluate.KnownScan(name, shown(item.name), item.read().xyz)
 
 
-def _result_lines(scores: Scores) -> list[str]:
+def _result_lines(scores: evaluate.Scores) -> list[str]:
     """Return a line for each method on all its scans, ours the last."""
     pooled, lines = tables.measured(scores.scans), []
     medians = scores.scans.groupby('method')['seconds'].median()
@@ -247,9 +225,9 @@ def _result_lines(scores: Scores) -> list[str]:
     return [f'{counted}; GroundGrid convention; median time of a frame', *lines]
 
 
-def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
+def frames_from_options(arguments: argparse.Namespace) -> list[semantic_kitti.Frame]:
     """Labelled frames of the options, grouped by sequence."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]
     columns, step = options.columns_of(arguments), arguments.frame_step or 1
-    return labelled_frames(arguments.root, chosen, columns, step)
+    return semantic_kitti.labelled_frames(arguments.root, chosen, columns, step)

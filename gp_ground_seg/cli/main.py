@@ -14,13 +14,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from typing import NoReturn
 
 from gp_ground_seg import __version__
-from gp_ground_seg.core.errors import (
-    GroundSegError,
-    in_one_line,
-    messages_passed_to,
-    reason_of,
-    shown,
-)
+from gp_ground_seg.core import errors
 
 ROS_ARGS = '--ros-args'
 
@@ -57,7 +51,7 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise a GroundSegError, which names the help."""
-        raise GroundSegError(f'{message.removeprefix("argument ")}; see {self.prog} --help')
+        raise errors.GroundSegError(f'{message.removeprefix("argument ")}; see {self.prog} --help')
 
 
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:
@@ -87,7 +81,7 @@ def _parse(words: list[str]) -> argparse.Namespace:
     arguments = parser.parse_args(words[:n_before])
     arguments.ros_args = words[n_before:]
     if arguments.ros_args and not hasattr(arguments, 'accepts_ros_args'):
-        raise GroundSegError(f'{command}: {ROS_ARGS}: this command takes none')
+        raise errors.GroundSegError(f'{command}: {ROS_ARGS}: this command takes none')
     return arguments
 
 
@@ -95,10 +89,13 @@ def _notes(arguments: argparse.Namespace) -> AbstractContextManager[None]:
     """Print what the library logs as notes, except in a node, which logs by way of ROS."""
     if hasattr(arguments, 'accepts_ros_args'):
         return nullcontext()
-    from gp_ground_seg.cli.options import note
+
+    def note(_level: int, text: str) -> None:
+        with suppress(OSError):  # standard error may be full
+            print(f'gp-ground-seg: note: {errors.shown(text)}', file=sys.stderr)
 
     level = logging.WARNING if getattr(arguments, 'quiet', False) else logging.INFO
-    return messages_passed_to(lambda _, text: note(text), level)
+    return errors.messages_passed_to(note, level)
 
 
 @contextmanager
@@ -137,18 +134,6 @@ def _abandon_stdout() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _run(words: list[str]) -> int:
-    """Run the command; raise what it raises, or what standard output does at its end."""
-    try:
-        with _interruptible():
-            arguments = _parse(words)
-            with _notes(arguments):
-                code: int = arguments.run(arguments)
-    finally:
-        print(end='', flush=True)  # also after --help, which ends by SystemExit
-    return code
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command of `argv`, by default of the process, and return its exit code.
 
@@ -158,17 +143,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors='backslashreplace')  # names of files need not be UTF-8
     try:
-        return _run(list(sys.argv[1:] if argv is None else argv))
+        try:
+            with _interruptible():
+                arguments = _parse(list(sys.argv[1:] if argv is None else argv))
+                with _notes(arguments):
+                    code: int = arguments.run(arguments)
+        finally:
+            print(end='', flush=True)  # also after --help, which ends by SystemExit
+        return code
     except BrokenPipeError:  # the reader of our output went away, as `| head` does
         _abandon_stdout()
         return 0
-    except GroundSegError as error:
+    except errors.GroundSegError as error:
         line = str(error)
     except OSError as error:
         _abandon_stdout()
-        line = f'{error.filename or "input or output"}: {reason_of(error)}'
+        line = f'{error.filename or "input or output"}: {errors.reason_of(error)}'
     except UnicodeError as error:
-        line = f'{in_one_line(error)}: a name or text is not UTF-8'
+        line = f'{errors.in_one_line(error)}: a name or text is not UTF-8'
     except MemoryError:
         line = 'not enough memory for this input'
     except RuntimeError as error:  # of `Path.resolve`, before Python 3.13
@@ -178,5 +170,5 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('gp-ground-seg: interrupted', file=sys.stderr)
         return 130
-    print(f'gp-ground-seg: error: {shown(line)}', file=sys.stderr)
+    print(f'gp-ground-seg: error: {errors.shown(line)}', file=sys.stderr)
     return 2

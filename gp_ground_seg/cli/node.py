@@ -7,7 +7,8 @@ import sys
 import time
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import GroundSegError, MissingDependencyError, install_hint, shown
+from gp_ground_seg.core import errors
+from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.ros.node_process import run_node
 
 NODE_EXAMPLES = """\
@@ -29,12 +30,12 @@ WARM_UP_EXAMPLES = """\
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands; what follows ``--ros-args`` is left to ROS or the node."""
     description = 'Run the ROS 2 node: points in, ground and obstacles out.'
-    parser = options.new_parser(subparsers, 'node', description, NODE_EXAMPLES)
+    parser = options.command(
+        subparsers, 'node', description, NODE_EXAMPLES,
+        run=lambda given: run_node(given.ros_args), accepts_ros_args=True,
+    )  # fmt: skip
     parser.usage = 'gp-ground-seg node [--ros-args ...]'
-    parser.set_defaults(run=lambda a: run_node(a.ros_args), accepts_ros_args=True)
-
-    parser = options.new_parser(subparsers, 'warm-up', WARM_UP_DESCRIPTION, WARM_UP_EXAMPLES)
-    parser.set_defaults(run=run_warm_up)
+    options.command(subparsers, 'warm-up', WARM_UP_DESCRIPTION, WARM_UP_EXAMPLES, run=run_warm_up)
 
 
 def main(*, is_managed: bool = False) -> int:
@@ -42,7 +43,7 @@ def main(*, is_managed: bool = False) -> int:
     try:
         return run_node(sys.argv[1:], is_managed=is_managed)
     except GroundSegError as error:
-        print(f'ground_segmentation_node: error: {shown(error)}', file=sys.stderr)
+        print(f'ground_segmentation_node: error: {errors.shown(error)}', file=sys.stderr)
         return 2
 
 
@@ -57,10 +58,10 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
     from gp_ground_seg.ros.loader import compile_all
 
     if not HAVE_NUMBA:
-        raise MissingDependencyError(
-            f'numba is not installed, nothing to compile: {install_hint("numba")}'
+        raise errors.MissingDependencyError(
+            f'numba is not installed, nothing to compile: {errors.install_hint("numba")}'
         )
-    options.note('compiling what is not on disk yet: 20 to 60 s for all of it')
+    errors.LOGGER.info('compiling what is not on disk yet: 20 to 60 s for all of it')
     begin = time.monotonic()
     compile_all()
     seconds, folder = time.monotonic() - begin, code_folder()

@@ -1,9 +1,8 @@
-"""Shared by the commands: options, kinds of values, notes, progress over frames."""
+"""Shared by the commands: options, kinds of values, progress over frames."""
 
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 import textwrap
 from collections.abc import Callable, Iterable
@@ -14,7 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from gp_ground_seg.core.errors import ConfigError, DataError, in_thousands, shown
+from gp_ground_seg.core.errors import LOGGER, ConfigError, DataError, in_thousands
 from gp_ground_seg.core.jit import has_to_compile
 from gp_ground_seg.core.parameters.config import PRESETS, Config, find_preset
 from gp_ground_seg.core.parameters.schema import load_yaml
@@ -27,6 +26,8 @@ COMPILING_PAYS = 300  # scans
 WIDTH = 79  # of the texts of help
 LINE_PERIOD = 30.0  # time between lines of progress where there is no terminal [s]
 BAR = '{desc} |{bar}| {n_fmt} of {total_fmt} frames done, {remaining} left'
+Option = tuple[str, str, dict[str, Any]]
+"""Names of an option, its help, and what else `add_argument` takes."""
 FLAG = {'action': 'store_true'}
 FORCE = ('--force', 'replace existing output', FLAG)
 MARKDOWN = ('--markdown', 'print the tables as Markdown', FLAG)
@@ -34,48 +35,86 @@ QUIET = ('--quiet', 'no progress bar, no notes', FLAG)
 TO_JSON = ('--json', 'write every number to this file as well', {'metavar': 'FILE'})
 
 
-def new_parser(
+def command(
     subparsers: argparse._SubParsersAction[argparse.ArgumentParser],
     name: str,
     description: str,
     examples: str,
+    *options: Option | list[Option],
     purpose: str = '',
+    **defaults: Any,
 ) -> argparse.ArgumentParser:
-    """Return the parser of a command; paragraphs are filled, examples keep their line breaks."""
+    """Declare a command; paragraphs are filled, examples keep their line breaks.
+
+    Of options in a list only one may be given. `defaults` are values of the parsed arguments.
+    """
     paragraphs = (textwrap.fill(part, WIDTH) for part in description.split('\n\n'))
-    return subparsers.add_parser(
+    parser = subparsers.add_parser(
         name,
         help=purpose,
         description='\n\n'.join(paragraphs),
         epilog=f'examples:\n{examples}',
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.set_defaults(**defaults)
+    for entry in options:
+        group = parser if isinstance(entry, tuple) else parser.add_mutually_exclusive_group()
+        for names, text, more in [entry] if isinstance(entry, tuple) else entry:
+            group.add_argument(*names.split(), help=text, **more)
+    return parser
 
 
-def add(parser: argparse._ActionsContainer, *options: tuple[str, str, dict[str, Any]]) -> None:
-    """Add options: names, help, and what else `add_argument` takes."""
-    for names, text, more in options:
-        parser.add_argument(*names.split(), help=text, **more)
+def value(read: Callable[[str], Any], accepts: Callable[[Any], Any], wanted: str) -> Any:
+    """Return the type of an option: what `read` makes of its text, if that is accepted."""
+
+    def parse(text: str) -> Any:
+        with suppress(ValueError):
+            if accepts(found := read(text)):
+                return found
+        raise argparse.ArgumentTypeError(f'{text!r}: must be {wanted}')
+
+    return parse
 
 
-def positive(word: str, least: int = 1) -> int:
-    """Whole number, at least 1."""
-    if not word.isdecimal() or int(word) < least:
-        raise argparse.ArgumentTypeError(f'{word!r}: must be a whole number, at least {least}')
-    return int(word)
+def whole(least: int) -> dict[str, Any]:
+    """Return what `add_argument` takes of a whole number."""
+    wanted = f'a whole number, at least {least}'
+    read = value(lambda text: text.isdecimal() and int(text), lambda n: n >= least, wanted)
+    return {'metavar': 'N', 'type': read}
 
 
-NUMBER: dict[str, Any] = {'metavar': 'N', 'type': positive}
-COLUMNS: tuple[str, str, dict[str, Any]] = (
+def some_of(known: Iterable[str]) -> Any:
+    """Return the type of a comma-separated list of `known` names, each at most once."""
+    names = list(known)
+    wanted = f'some of {",".join(names)}, each once'
+    return value(lambda t: t.split(','), lambda w: len({*w} & {*names}) == len(w), wanted)
+
+
+NUMBER = whole(1)
+COLUMNS: Option = (
     '--columns', f'numbers per point of a .bin scan, x y z first (default: {KITTI_COLUMNS})',
-    {'metavar': 'N', 'type': partial(positive, least=MIN_COLUMNS)},
+    whole(MIN_COLUMNS),
 )  # fmt: skip
 """Option of every command that reads ``.bin`` scans."""
-CLOUDS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+CLOUDS: tuple[Option, ...] = (
     ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
     COLUMNS,
 )
 """Options of every command that reads clouds of any format."""
+CLUSTER: list[Option] = [
+    ('--workers', 'compute in N processes of this machine', NUMBER),
+    ('--scheduler', 'compute on the Dask cluster of this scheduler, as in tcp://HOST:8786',
+     {'metavar': 'ADDRESS'}),
+]  # fmt: skip
+"""Options of `runner`."""
+CONFIG: tuple[Option, ...] = (
+    ('--preset', f'set of parameters: {", ".join(PRESETS)} (default: {DEFAULT_PRESET})',
+     {'metavar': 'NAME', 'default': DEFAULT_PRESET}),
+    ('--config', 'parameter file (YAML), over the preset', {'metavar': 'FILE'}),
+    ('--set', 'one parameter, as in --set label.ground_tolerance=0.15 (may be repeated)',
+     {'metavar': 'NAME=VALUE', 'action': 'append', 'default': [], 'dest': 'settings'}),
+)  # fmt: skip
+"""Options of `read_config`."""
 
 
 def list_clouds(arguments: argparse.Namespace, source: Path | None = None) -> Inputs:
@@ -101,56 +140,10 @@ def refuse(arguments: argparse.Namespace, names: Iterable[str], reason: str) -> 
             raise DataError(f'--{name.replace("_", "-")}: {reason}')
 
 
-def add_cluster(parser: argparse.ArgumentParser) -> None:
-    """Add ``--workers N`` and ``--scheduler ADDRESS``."""
-    add(
-        parser.add_mutually_exclusive_group(),
-        ('--workers', 'compute in N processes of this machine', NUMBER),
-        ('--scheduler', 'compute on the Dask cluster of this scheduler, as in tcp://HOST:8786',
-         {'metavar': 'ADDRESS'}),
-    )  # fmt: skip
-
-
 def runner(arguments: argparse.Namespace, title: str) -> AbstractContextManager[Runner]:
-    """Return a runner of blocks of frames by the options of `add_cluster`, with a bar."""
+    """Return a runner of blocks of frames by the options `CLUSTER`, with a bar."""
     bar = progress(title, quiet=getattr(arguments, 'quiet', False))
     return open_runner(arguments.workers, arguments.scheduler, bar)
-
-
-def above_zero(text: str, *, or_zero: bool = False) -> float:
-    """Read a number above 0, or 0."""
-    number = float(text)
-    if not (0.0 < number < math.inf or (or_zero and number == 0.0)):
-        least = 'at least 0' if or_zero else 'above 0'
-        raise argparse.ArgumentTypeError(f'{text!r}: must be a number, {least}')
-    return number
-
-
-def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:
-    """Return the type of a comma-separated list of `known` names, each at most once."""
-    names = list(known)
-
-    def parse(text: str) -> list[str]:
-        words = text.split(',')
-        if len({*words} & {*names}) < len(words):
-            wanted = f'some of {",".join(names)}, each once'
-            raise argparse.ArgumentTypeError(f'{text!r}: must be {wanted}')
-        return words
-
-    return parse
-
-
-def add_config(parser: argparse.ArgumentParser) -> None:
-    """Add ``--preset NAME``, ``--config FILE`` and ``--set NAME=VALUE``."""
-    presets = f'set of parameters: {", ".join(PRESETS)} (default: {DEFAULT_PRESET})'
-    setting = 'one parameter, as in --set label.ground_tolerance=0.15 (may be repeated)'
-    repeated = {'action': 'append', 'default': [], 'dest': 'settings'}
-    add(
-        parser,
-        ('--preset', presets, {'metavar': 'NAME', 'default': DEFAULT_PRESET}),
-        ('--config', 'parameter file (YAML), over the preset', {'metavar': 'FILE'}),
-        ('--set', setting, {'metavar': 'NAME=VALUE', **repeated}),
-    )
 
 
 def read_config(arguments: argparse.Namespace) -> Config:
@@ -175,7 +168,7 @@ def spare_compiling(config: Config, n_scans: int) -> Config:
 def note_spared(given: Config, used: Config) -> None:
     """Say how to have compiled code, where `spare_compiling` has done without."""
     if used.runtime != given.runtime:
-        note('segmented with numpy; to have compiled code, run gp-ground-seg warm-up once')
+        LOGGER.info('segmented with numpy; to have compiled code, run gp-ground-seg warm-up once')
 
 
 def parse_setting(setting: str) -> tuple[str, Any]:
@@ -187,12 +180,6 @@ def parse_setting(setting: str) -> tuple[str, Any]:
         return name.strip(), load_yaml(text)
     except ConfigError as error:
         raise ConfigError(f'--set {name}: {error}') from error
-
-
-def note(message: str) -> None:
-    """Print a line on standard error that is neither result nor error."""
-    with suppress(OSError):  # standard error may be full
-        print(f'gp-ground-seg: note: {shown(message)}', file=sys.stderr)
 
 
 def count(number: int, noun: str) -> str:

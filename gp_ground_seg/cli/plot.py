@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import DataError, shown
+from gp_ground_seg.core.errors import LOGGER, DataError, shown
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.semantic_kitti import read_entries
@@ -41,34 +41,32 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Declare the command and its pictures."""
     description = 'Draw a segmented scan: in perspective, or one segment of it.'
     examples = SCAN_EXAMPLES + SEGMENT_EXAMPLES
-    parser = options.new_parser(subparsers, 'plot', description, examples)
+    parser = options.command(subparsers, 'plot', description, examples)
+    wanted = 'three numbers, up to 360 and 89 degrees, and 1 to 1000 m'
+    camera = options.value(lambda text: [*map(float, text.split(','))], _can_look, wanted)
+    wanted = 'whole numbers, as 90,91'
+    numbers = options.value(lambda text: [*map(int, text.split(','))], bool, wanted)
     pictures = parser.add_subparsers(metavar='PICTURE', required=True, dest='picture')
-    scan = options.new_parser(pictures, 'scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective')
-    scan.add_argument(
-        '--camera', metavar='AZIMUTH,ELEVATION,DISTANCE', type=camera,
-        help='where it stands, seen from the middle of the scene: counter-clockwise from ahead '
-        'within 360 deg, upwards within 89 deg, 1 to 1000 m away (default: 196,24 and as near '
-        'as the cloud is small)',
+    of_both: tuple[options.Option, ...] = (
+        ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
+        ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'}),
+        ('--frame', 'which of several, from 0 (default: 0)', {'metavar': 'N', 'type': int}),
+        ('-o --output', f'{ENDINGS} file', {'metavar': 'OUT', 'required': True}),
+        *options.CLOUDS, options.FORCE, *options.CONFIG,
     )  # fmt: skip
-    segment = options.new_parser(
-        pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, 'a segment from the side'
-    )
-    segment.add_argument(
-        '--segment', metavar='N[,N]', type=numbers, required=True,
-        help='number of the segment, or of several side by side',
+    options.command(
+        pictures, 'scan', SCAN, SCAN_EXAMPLES,
+        ('--camera', 'where it stands, seen from the middle of the scene: counter-clockwise from '
+         'ahead within 360 deg, upwards within 89 deg, 1 to 1000 m away (default: 196,24 and as '
+         'near as the cloud is small)', {'metavar': 'AZIMUTH,ELEVATION,DISTANCE', 'type': camera}),
+        *of_both, purpose='a scan in perspective', run=run,
     )  # fmt: skip
-    for picture in (scan, segment):
-        options.add(
-            picture,
-            ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
-            ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'}),
-            ('--frame', 'which of several, from 0 (default: 0)', {'metavar': 'N', 'type': int}),
-            ('-o --output', f'{ENDINGS} file', {'metavar': 'OUT', 'required': True}),
-            *options.CLOUDS,
-            options.FORCE,
-        )  # fmt: skip
-        options.add_config(picture)
-        picture.set_defaults(run=run)
+    options.command(
+        pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES,
+        ('--segment', 'number of the segment, or of several side by side',
+         {'metavar': 'N[,N]', 'type': numbers, 'required': True}),
+        *of_both, purpose='a segment from the side', run=run,
+    )  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -81,41 +79,27 @@ def run(arguments: argparse.Namespace) -> int:
     scans = options.list_clouds(arguments)
     scan = scans[arguments.frame or 0]
     if arguments.frame is None and len(scans) > 1:
-        others = ''.join(f', {one.title}' for one in scans.files[1:4])
-        options.note(f'the first of {len(scans)} clouds, {scan.title}{others} ...: see --frame')
+        first = ', '.join([scan.title, *(one.title for one in scans.files[1:4])])
+        LOGGER.info('the first of %d clouds, %s ...: see --frame', len(scans), first)
     points, title, truth = scan.read().xyz, shown(scan.title), None
     if arguments.labels is not None:
         truth = true_labels(read_entries(arguments.labels, len(points)) & 0xFFFF)
     used = options.spare_compiling(config, 1)
     result = GroundSegmenter(used).segment(points)
     if arguments.picture == 'scan':
-        view = points, result.label, path, title, arguments.camera
-        said = plotting.plot_scan_view(*view, truth=truth)
+        camera = arguments.camera and plotting.camera_at(*arguments.camera)
+        said = plotting.plot_scan_view(points, result.label, path, title, camera, truth=truth)
     else:
         said = plotting.plot_segment(result, points, arguments.segment, path, truth, title)
     for line in result.pose.contradictions:
-        options.note(line)
+        LOGGER.info('%s', line)
     print(f'sensor: {plotting.words_of_pose(result.pose)}')
     print(f'{said}, written to {shown(path)}')
     options.note_spared(config, used)
     return 0
 
 
-def numbers(text: str) -> list[int]:
-    """Read numbers of segments."""
-    try:
-        return [int(word) for word in text.split(',')]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f'{text!r}: must be whole numbers, as 90,91') from None
-
-
-def camera(text: str) -> plotting.Place:
-    """Read azimuth, elevation and distance; straight from above no side of a picture is up."""
-    try:
-        azimuth, elevation, distance = map(float, text.split(','))
-        if not (abs(azimuth) <= 360.0 and abs(elevation) <= 89.0 and 1.0 <= distance <= 1000.0):
-            raise ValueError
-    except ValueError:
-        wanted = 'must be three numbers, up to 360 and 89 degrees, and 1 to 1000 m'
-        raise argparse.ArgumentTypeError(f'{text!r}: {wanted}') from None
-    return plotting.camera_at(azimuth, elevation, distance)
+def _can_look(view: list[float]) -> bool:
+    """Whether a camera can look from there; straight from above no side of a picture is up."""
+    azimuth, elevation, distance = view
+    return abs(azimuth) <= 360.0 and abs(elevation) <= 89.0 and 1.0 <= distance <= 1000.0

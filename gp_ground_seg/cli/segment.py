@@ -15,20 +15,10 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
-from gp_ground_seg.data.bags import BAG_SUFFIXES
+from gp_ground_seg.data import bags, files, inputs, semantic_kitti
 from gp_ground_seg.data.cloud_files import FORMATS, LABELS
-from gp_ground_seg.data.files import write_file
-from gp_ground_seg.data.inputs import Inputs, holds_bag
-from gp_ground_seg.data.semantic_kitti import is_root, list_sequences
-from gp_ground_seg.lab.dataset import (
-    PARAMETERS,
-    Outcome,
-    find_difference,
-    find_left,
-    output_of,
-    segment_bag,
-    segment_scans,
-)
+from gp_ground_seg.data.inputs import Inputs
+from gp_ground_seg.lab import dataset
 
 DESCRIPTION = """\
 Split scans into ground and obstacles.
@@ -58,10 +48,8 @@ EXAMPLES = """\
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
-    parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
-    parser.usage = '%(prog)s INPUT [-o OUT] [options]'
-    options.add(
-        parser,
+    parser = options.command(
+        subparsers, 'segment', DESCRIPTION, EXAMPLES,
         ('input', 'scan, folder of scans, bag, or a root', {'metavar': 'INPUT'}),
         ('more', argparse.SUPPRESS, {'nargs': '*', 'default': []}),
         ('-o --output', 'for scans a folder, or a file for a single scan; for a bag a folder, '
@@ -70,13 +58,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--format', 'of a file for each scan or cloud (default: by the name of OUT, else labels '
          f'of .bin scans, and as the input): {", ".join(FORMATS)}',
          {'choices': FORMATS, 'metavar': 'FORMAT'}),
-        *options.CLOUDS,
-        options.FORCE,
-        options.QUIET,
+        *options.CLOUDS, options.FORCE, options.QUIET, options.CLUSTER, *options.CONFIG, run=run,
     )  # fmt: skip
-    options.add_cluster(parser)
-    options.add_config(parser)
-    parser.set_defaults(run=run)
+    parser.usage = '%(prog)s INPUT [-o OUT] [options]'
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -94,24 +78,23 @@ def run(arguments: argparse.Namespace) -> int:
     folder, place = (target.parent, target) if is_one else (target, target.resolve())
     if not place.parent.is_dir():
         raise DataError(f'{target}: the folder {place.parent} does not exist')
-    outputs = [target] if is_one else [output_of(folder, form, scan) for scan in scans]
+    outputs = [target] if is_one else [dataset.output_of(folder, form, scan) for scan in scans]
     parameters = None if is_one else _parameters(arguments, config)
-    left = find_left(scans, outputs, folder, parameters, force=arguments.force)
+    left = dataset.find_left(scans, outputs, folder, parameters, force=arguments.force)
     if len(left) < len(scans):
         print(f'{len(scans) - len(left)} of {len(scans)} were finished before')
     if not left:
         return 0
     used = options.spare_compiling(config, len(left))
-    write = partial(segment_scans, folder, form, used)
+    write = partial(dataset.segment_scans, folder, form, used)
     if is_one and scans.topic:
-        write = partial(segment_bag, target, used)
+        write = partial(dataset.segment_bag, target, used)
     with options.runner(arguments, 'segment') as runner:
-        if parameters and (arguments.force or find_difference(folder, parameters)):
-            write_file(folder / PARAMETERS, parameters.encode())
+        if parameters and (arguments.force or dataset.find_difference(folder, parameters)):
+            files.write_file(folder / dataset.PARAMETERS, parameters.encode())
         found = runner.run(write, left)
     _print_summary([*chain(*found)], target, runner.n_workers)
-    if not arguments.quiet:
-        options.note_spared(config, used)
+    options.note_spared(config, used)
     return 0
 
 
@@ -120,16 +103,16 @@ def _list_scans(
 ) -> tuple[Inputs, str | None, bool]:
     """Return what to segment, and the format of its files; whether they are one, or one bag."""
     form, suffix = arguments.format, target.suffix[1:]
-    if is_root(source):
+    if semantic_kitti.is_root(source):
         if form not in (None, LABELS):
             raise DataError(f'--format {form}: a KITTI_ROOT gives .label files')
         # Where SemanticKITTI's tools look for predictions.
-        files = [
+        labels = [
             replace(scan, name=f'sequences/{name}/predictions/{scan.name}')
-            for name in list_sequences(source)
+            for name in semantic_kitti.list_sequences(source)
             for scan in options.list_clouds(arguments, source / 'sequences' / name)
         ]
-        return Inputs(source, files), LABELS, False
+        return Inputs(source, labels), LABELS, False
     scans = options.list_clouds(arguments)
     if scans.topic:
         options.refuse(arguments, ('workers', 'scheduler'), 'is for scans, not for a bag')
@@ -146,7 +129,7 @@ def _list_scans(
 def _parameters(arguments: argparse.Namespace, config: Config) -> str:
     """Return what the files of an output folder depend on, beside the content of the inputs."""
     source = Path(arguments.input).resolve()
-    if not (source.is_dir() or holds_bag(source)):
+    if not (source.is_dir() or inputs.holds_bag(source)):
         source = source.parent  # the same names from elsewhere are other inputs
     title = f'written by gp-ground-seg segment {__version__}, from {source}'
     for name in 'topic', 'columns':
@@ -161,11 +144,11 @@ def _default_output(source: Path, form: str | None = None) -> Path:
         return named.with_name(f'{named.name}_ground')
     suffix = '' if named.suffix in ('.bag', '.bin') else named.suffix
     if form is not None:
-        suffix = '' if named.suffix in BAG_SUFFIXES else f'.{form}'
+        suffix = '' if named.suffix in bags.BAG_SUFFIXES else f'.{form}'
     return named.with_name(f'{named.stem}_ground{suffix}')
 
 
-def _print_summary(found: Sequence[Outcome], target: Path, n_workers: int = 0) -> None:
+def _print_summary(found: Sequence[dataset.Outcome], target: Path, n_workers: int = 0) -> None:
     """Print points, ground, time, and height and tilt of the sensor."""
     seconds = [one.seconds for one in found]
     n_points, n_ground = sum(one.n_points for one in found), sum(one.n_ground for one in found)

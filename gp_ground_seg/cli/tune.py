@@ -29,12 +29,11 @@ needs the package viser (docs/install.md)
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = options.new_parser(subparsers, 'tune', DESCRIPTION, EXAMPLES)
     file, specs = {'metavar': 'FILE'}, tunable()
     basic = [spec.name for spec in specs if spec.basic]
     names = options.some_of(spec.name for spec in specs)
-    options.add(
-        parser,
+    options.command(
+        subparsers, 'tune', DESCRIPTION, EXAMPLES,
         ('input', 'scan, folder of scans, sequence or bag', {'metavar': 'INPUT'}),
         ('--labels', 'SemanticKITTI labels of a scan (default: those next to it)', file),
         ('--frame', 'number of the first frame to show, from 0',
@@ -44,12 +43,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--parameters', 'those to show (default: the basic ones)',
          {'metavar': 'NAME,NAME', 'type': names, 'default': basic}),
         ('-o --output', 'file to write (default: %(default)s)', {**file, 'default': 'tuned.yaml'}),
-        *options.CLOUDS,
-        options.FORCE,
-        options.QUIET,
+        *options.CLOUDS, options.FORCE, options.QUIET, *options.CONFIG, run=run,
     )  # fmt: skip
-    options.add_config(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -20,18 +20,8 @@ import numpy.typing as npt
 from gp_ground_seg.core.errors import DataError, PointCloudError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.pipeline.points import finite_points, hint_of_table, objection_to_ranges
-from gp_ground_seg.data.clouds import (
-    Cloud,
-    Columns,
-    Fields,
-    check_numbers,
-    cloud_of,
-    coordinate_names,
-    count_numbers,
-    gather,
-    name_columns,
-    scatter,
-)
+from gp_ground_seg.data import clouds
+from gp_ground_seg.data.clouds import Cloud, Columns, Fields
 from gp_ground_seg.data.files import MAX_SCAN_BYTES, naming, read_bytes
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
@@ -69,13 +59,13 @@ def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
         raise PointCloudError(f'is no file of numpy; it begins with {data[:20]!r}')
     found = np.load(io.BytesIO(data), allow_pickle=False)
     arrays: Columns = {TABLE: found} if isinstance(found, np.ndarray) else dict(found)
-    if coordinate_names(arrays)[0] not in arrays:
+    if clouds.coordinate_names(arrays)[0] not in arrays:
         table = arrays.pop(_table_of(arrays))
-        arrays = {**scatter(_points_of(table)), **arrays}
+        arrays = {**clouds.scatter(_points_of(table)), **arrays}
     first = next(iter(arrays.values()))
-    x = arrays.get(coordinate_names(arrays)[0], first)
+    x = arrays.get(clouds.coordinate_names(arrays)[0], first)
     fields = {name: v for name, v in arrays.items() if v.shape[:1] == x.shape[:1]}
-    return gather(fields), {name: v for name, v in arrays.items() if name not in fields}
+    return clouds.gather(fields), {name: v for name, v in arrays.items() if name not in fields}
 
 
 def _table_of(arrays: Columns) -> str:
@@ -106,7 +96,7 @@ def _points_of(table: npt.NDArray[Any]) -> Fields:
     if 0 < table.shape[0] < table.shape[1] >= _TRANSPOSED:
         problem = 'is transposed, or an image of ranges; a point is a row: save its .T'
         raise PointCloudError(f'array of shape {table.shape}: {problem}')
-    return name_columns(table)
+    return clouds.name_columns(table)
 
 
 def _encode_npy(cloud: Cloud) -> bytes:
@@ -121,7 +111,7 @@ def _encode_npz(cloud: Cloud) -> bytes:
     """File of an array for each field, and of arrays of another length."""
     file = io.BytesIO()
     others = cloud.header if isinstance(cloud.header, dict) else {}
-    arrays: dict[str, Any] = {**others, **scatter(cloud.fields)}
+    arrays: dict[str, Any] = {**others, **clouds.scatter(cloud.fields)}
     np.savez(file, **arrays)
     return file.getvalue()
 
@@ -146,17 +136,18 @@ _VALUES = ('height', 'ground_z', 'ground_std', 'p_ground')
 def read_file(path: Path, columns: int = KITTI_COLUMNS) -> Cloud:
     """Read a file; `columns` are the numbers of a point in a ``.bin``.
 
-    Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, or can be no scan.
-    nuScenes' ``.pcd.bin`` is known by its name.
+    Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
+    points, or can be no scan. nuScenes' ``.pcd.bin`` is known by its name.
     """
-    suffix = path.suffix.lower()
-    if suffix == '.bin':
-        if path.name.endswith(NUSCENES_SUFFIX) and columns == KITTI_COLUMNS:
-            columns = NUSCENES_COLUMNS
-        table = read_scan(path, columns)
-        return Cloud(name_columns(table), four_columns(table))
-    cloud = decode_file(path, read_bytes(path, MAX_SCAN_BYTES))
-    check_scan(path, cloud.xyz)
+    data, is_bin = read_bytes(path, MAX_SCAN_BYTES), path.suffix.lower() == '.bin'
+    if path.name.endswith(NUSCENES_SUFFIX) and columns == KITTI_COLUMNS:
+        columns = NUSCENES_COLUMNS
+    cloud = _read_bin(path, data, columns) if is_bin else decode_file(path, data)
+    with np.errstate(all='ignore'):
+        problem = find_objection(cloud.xyz[:, :3])
+    if problem:
+        more = '; a .bin holds float32: --columns chooses their number' if is_bin else ''
+        raise DataError(f'{path}: {problem}{more}')
     return cloud
 
 
@@ -164,8 +155,8 @@ def decode_file(path: Path, data: bytes) -> Cloud:
     """Cloud of the data of a file, of the format of `path`; DataError if it cannot be read."""
     with naming(path, f'cannot be read as {path.suffix}; is it whole?'), np.errstate(all='ignore'):
         fields, header = _READERS[path.suffix.lower()](data)
-        check_numbers(count_numbers(fields.dtype))
-        return cloud_of(fields, header)
+        clouds.check_numbers(clouds.count_numbers(fields.dtype))
+        return clouds.cloud_of(fields, header)
 
 
 def encode_file(path: Path, cloud: Cloud, columns: Columns) -> bytes:
@@ -196,27 +187,23 @@ def encode_output(path: Path, cloud: Cloud, result: Segmentation) -> bytes:
     return encode_file(path, cloud, {'label': result.label, **values})
 
 
-def read_scan(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[np.float32]:
-    """Read a ``.bin`` file of float32, x, y, z [m] first in each point: (N, columns).
-
-    Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
-    points, or can be no scan.
-    """
-    data = read_bytes(path, MAX_SCAN_BYTES)
+def _read_bin(path: Path, data: bytes, columns: int) -> Cloud:
+    """Cloud of float32, x, y, z [m] first in each point; a missing intensity is zero."""
     if len(data) % (4 * columns):
         raise DataError(
             f'{path}: {len(data)} bytes is not a whole number of points of {columns} float32: '
             'truncated? --columns chooses another number'
         )
     numbers = np.frombuffer(data, '<f4').astype(np.float32)
-    table = numbers.reshape(-1, columns)
     if better := find_columns(numbers, columns):
         raise DataError(
             f'{path}: read with {columns} columns each is a mixture; the points have {better} '
             f'numbers each: use --columns {better}'
         )
-    check_scan(path, table)
-    return table
+    table = numbers.reshape(-1, columns)
+    points = np.zeros((len(table), 4), dtype=np.float32)
+    points[:, :columns] = table[:, :4]
+    return Cloud(clouds.name_columns(table), points)
 
 
 def find_columns(numbers: npt.NDArray[np.float32], columns: int) -> int:
@@ -247,30 +234,11 @@ def _information(classes: npt.NDArray[np.intp], n: int) -> float:
     return float(np.log(n) + entr(share.sum(axis=0)).sum() - entr(share).sum())
 
 
-def four_columns(table: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
-    """Return x, y, z, intensity of a table (N, >= 3), (N, 4); a missing intensity is zero."""
-    points = np.zeros((len(table), 4), dtype=np.float32)
-    points[:, : table.shape[1]] = table[:, :4]
-    return points
-
-
-def check_scan(place: str | Path, xyz: npt.NDArray[np.floating]) -> None:
-    """Raise DataError, with the file or message, where points (N, >= 3) can be no scan."""
-    with np.errstate(all='ignore'):
-        problem = find_objection(xyz[:, :3])
-    if problem:
-        is_bin = str(place).endswith('.bin')
-        more = '; a .bin holds float32: --columns chooses their number' if is_bin else ''
-        raise DataError(f'{place}: {problem}{more}')
-
-
 def find_objection(xyz: npt.NDArray[np.floating]) -> str:
     """Return why points (N, 3) can be no scan, or ''."""
     # All are looked at where some of them raise a doubt.
-    return _objection(xyz[:: 1 + len(xyz) // _N_JUDGED]) and _objection(xyz)
-
-
-def _objection(xyz: npt.NDArray[np.floating]) -> str:
+    if len(xyz) > _N_JUDGED and not find_objection(xyz[:: 1 + len(xyz) // _N_JUDGED]):
+        return ''
     finite = xyz[finite_points(xyz)]
     if not len(finite):
         return f'none of {len(xyz)} points is finite' if len(xyz) else 'no points in it'

@@ -18,13 +18,8 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-from gp_ground_seg.core.errors import (
-    DataError,
-    GroundSegError,
-    PointCloudError,
-    in_one_line,
-    reason_of,
-)
+from gp_ground_seg.core import errors
+from gp_ground_seg.core.errors import DataError, PointCloudError
 
 MAX_SCAN_BYTES = 1 << 30  # of a file: 67 million points, a hundred times a dense scan
 PARTIAL_MARK = '.partial-'  # part of the names of hidden folders with unfinished output
@@ -39,7 +34,7 @@ def read_bytes(path: str | Path, most: int, expected: str = '') -> bytes:
             # A pipe or a device has the size 0, and may have no end.
             data = b'' if size > most else file.read(size or most + 1)
     except OSError as error:
-        raise DataError(f'{path}: {reason_of(error)}') from error
+        raise DataError(f'{path}: {errors.reason_of(error)}') from error
     if max(size, len(data)) > most:
         expected = expected or f'accepted are at most {most}'
         raise DataError(f'{path}: {max(size, len(data))} bytes, {expected}')
@@ -67,9 +62,9 @@ def naming(place: str | Path, what: str = '') -> Iterator[None]:
     except PointCloudError as error:
         raise DataError(f'{place}: {error}') from error
     except Exception as error:  # Of many types: struct.error, zlib.error, sqlite3, lz4, ...
-        if not what or isinstance(error, GroundSegError):
+        if not what or isinstance(error, errors.GroundSegError):
             raise
-        said = f'{type(error).__name__}: {in_one_line(error)}'
+        said = f'{type(error).__name__}: {errors.in_one_line(error)}'
         raise DataError(f'{place}: {what} ({said})') from error
 
 
@@ -79,7 +74,7 @@ def writing(path: str | Path) -> Iterator[None]:
     try:
         yield
     except (OSError, sqlite3.Error) as error:
-        raise DataError(f'{path}: cannot be written: {reason_of(error)}') from error
+        raise DataError(f'{path}: cannot be written: {errors.reason_of(error)}') from error
 
 
 def check_writable(target: str | Path, *, force: bool) -> None:
@@ -173,7 +168,7 @@ def staged_file(
     except OSError as error:
         if not str(error.filename).startswith(str(hidden)):
             raise  # of something else in the block
-        raise DataError(f'{target}: cannot be written: {reason_of(error)}') from error
+        raise DataError(f'{target}: cannot be written: {errors.reason_of(error)}') from error
 
 
 def _check(target: str | Path, force: bool, is_kind: Callable[[Path], bool], path: Path) -> None:

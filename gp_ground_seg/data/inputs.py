@@ -58,8 +58,7 @@ class Inputs(Sequence[Input]):
 
     def __iter__(self) -> Iterator[Input]:
         """Yield each cloud, not read yet."""
-        if self.topic is None:
-            yield from self.files
+        yield from self.files  # of a bag none
         for k, (place, _, raw) in enumerate(self.messages()):
             title = shown(f'{self.path.name}[{k}]')
             yield Input(f'{k:06d}', title, self.path, partial(_decode, raw, place))

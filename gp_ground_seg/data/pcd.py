@@ -16,17 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError, require
-from gp_ground_seg.data.clouds import (
-    Cloud,
-    Fields,
-    check_numbers,
-    distinct,
-    gather,
-    in_types,
-    read_lines,
-    read_table,
-    split_header,
-)
+from gp_ground_seg.data import clouds
+from gp_ground_seg.data.clouds import Cloud, Fields
 
 _MAX_EXPANSION = 88  # of LZF: three bytes repeat 264 at most
 _MAX_NUMBER = 1 << 32  # in a header
@@ -49,7 +40,7 @@ def read_pcd(data: bytes) -> tuple[Fields, PcdHeader]:
     Keys are read in capitals or not, COLUMNS as FIELDS, and what is not given is as PCL takes it:
     float32 of one number, and one row.
     """
-    lines, rest = split_header(data, 'DATA')
+    lines, rest = clouds.split_header(data, 'DATA')
     entries = {words[0].upper(): words[1:] for words in map(str.split, lines)}
     names = entries.get('FIELDS') or entries.get('COLUMNS')
     if not names:
@@ -61,14 +52,15 @@ def read_pcd(data: bytes) -> tuple[Fields, PcdHeader]:
         packed = np.dtype([entry for entry in types if _PADDING not in entry[0]])
         fields = _read_compressed(rest, packed, width * height)
     elif form == 'ascii':
-        fields = read_lines(rest, np.dtype(types), width * height)
+        fields = clouds.read_lines(rest, np.dtype(types), width * height)
     elif form == 'binary':
-        fields = read_table(rest, np.dtype(types), width * height)
+        fields = clouds.read_table(rest, np.dtype(types), width * height)
     else:
         raise PointCloudError(f'DATA {form}: must be ascii, binary or binary_compressed')
     kept = [name for name in fields.dtype.names or () if _PADDING not in name]
     viewpoint = ' '.join(entries.get('VIEWPOINT', PcdHeader().viewpoint.split()))
-    return gather({name: fields[name] for name in kept}), PcdHeader(width, height, viewpoint)
+    header = PcdHeader(width, height, viewpoint)
+    return clouds.gather({name: fields[name] for name in kept}), header
 
 
 def _shape_of(entries: dict[str, list[str]]) -> tuple[int, int]:
@@ -101,13 +93,14 @@ def _types_of(names: list[str], entries: dict[str, list[str]]) -> list[tuple[str
         pairs = zip(defaults, columns, strict=True)
         counts = ', '.join(f'{len(column)} {key}' for key, column in pairs)
         raise PointCloudError(f'{len(names)} FIELDS, but {counts}; spaces in a name?')
-    for given, name, kind, size, count in zip(names, distinct(names), *columns, strict=True):
+    rows = zip(names, clouds.distinct(names), *columns, strict=True)
+    for given, name, kind, size, count in rows:
         code, shape = f'{kind.lower()}{size}', () if count == '1' else (_number('COUNT', count),)
         if code not in _TYPES:
             raise PointCloudError(f'field {name}: no type {kind} of {size} bytes')
         types.append((f'{_PADDING}{name}' if given == '_' else name, f'<{code}', shape))
     # numpy adds their bytes in 32 bits, and would read outside of the file.
-    check_numbers(sum(math.prod(shape) for _, _, shape in types))
+    clouds.check_numbers(sum(math.prod(shape) for _, _, shape in types))
     return types
 
 
@@ -133,7 +126,7 @@ def _read_compressed(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields
 
 def encode_pcd(cloud: Cloud) -> bytes:
     """Binary file of a cloud, organised and with the viewpoint as it was read."""
-    fields = in_types(cloud.fields, _TYPES, 'PCD')
+    fields = clouds.in_types(cloud.fields, _TYPES, 'PCD')
     header = cloud.header if isinstance(cloud.header, PcdHeader) else PcdHeader()
     if header.width * header.height != len(fields):
         header = header._replace(width=len(fields), height=1)

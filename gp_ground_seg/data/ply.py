@@ -15,16 +15,8 @@ from typing import Any
 import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError, log_once
-from gp_ground_seg.data.clouds import (
-    Cloud,
-    Fields,
-    check_size,
-    distinct,
-    in_types,
-    read_lines,
-    read_table,
-    split_header,
-)
+from gp_ground_seg.data import clouds
+from gp_ground_seg.data.clouds import Cloud, Fields
 
 _CODES = {
     'char': 'i1', 'uchar': 'u1', 'short': 'i2', 'ushort': 'u2', 'int': 'i4', 'uint': 'u4',
@@ -45,7 +37,7 @@ def read_ply(data: bytes) -> tuple[Fields, list[str]]:
     PointCloudError if it cannot be a PLY, if the vertices are not its first element, or if a list
     is before one of their numbers.
     """
-    lines, body = split_header(data, 'end_header')
+    lines, body = clouds.split_header(data, 'end_header')
     remarks = [line for line in lines if line.split()[0] in ('comment', 'obj_info')]
     entries = [line.split() for line in lines if line not in remarks]
     form = ' '.join(next((words[1:2] for words in entries if words[0] == 'format'), [])).lower()
@@ -62,11 +54,11 @@ def read_ply(data: bytes) -> tuple[Fields, list[str]]:
     properties = [words for words in entries[begin:end] if words[0] == 'property']
     dtype, lists = _types_of(properties, is_big)
     if form == 'ascii':
-        fields = read_lines(body, dtype, n_points)
+        fields = clouds.read_lines(body, dtype, n_points)
     else:
         if lists:
             body = _without_lists(body, dtype.itemsize, lists, is_big, n_points)
-        fields = read_table(body, dtype, n_points)
+        fields = clouds.read_table(body, dtype, n_points)
     return fields.astype(fields.dtype.newbyteorder('=')), remarks
 
 
@@ -89,7 +81,7 @@ def _types_of(properties: list[list[str]], is_big: bool) -> tuple[np.dtype[Any],
             codes.append(f'{">" if is_big else "<"}{found[0]}')
     if lists:
         log_once(logging.INFO, f'PLY: lists of the vertices are left out: {", ".join(lists)}')
-    dtype = np.dtype(list(zip(distinct(names), codes, strict=True)))
+    dtype = np.dtype(list(zip(clouds.distinct(names), codes, strict=True)))
     return dtype, list(lists.values())
 
 
@@ -97,7 +89,7 @@ def _without_lists(
     data: bytes, n_bytes: int, lists: _ListSizes, is_big: bool, n_points: int
 ) -> bytes:
     """Rows of a body, each cut to its first `n_bytes`."""
-    check_size(len(data), n_points, n_points * (n_bytes + sum(count for count, _ in lists)))
+    clouds.check_size(len(data), n_points, n_points * (n_bytes + sum(count for count, _ in lists)))
     rows, place = [], 0
     for _ in range(n_points):
         rows.append(data[place : place + n_bytes])
@@ -105,13 +97,13 @@ def _without_lists(
         for count, item in lists:
             n_items = int.from_bytes(data[place : place + count], 'big' if is_big else 'little')
             place += count + item * n_items
-    check_size(len(data), n_points, place)
+    clouds.check_size(len(data), n_points, place)
     return b''.join(rows)
 
 
 def encode_ply(cloud: Cloud) -> bytes:
     """File of a cloud as vertices, binary, with the comments it was read with."""
-    fields = in_types(cloud.fields, _NAMES, 'PLY', flat=True)
+    fields = clouds.in_types(cloud.fields, _NAMES, 'PLY', flat=True)
     lines = [
         'ply',
         'format binary_little_endian 1.0',

@@ -11,11 +11,10 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.errors import LOGGER, DataError
 from gp_ground_seg.core.frame import BoolArray
-from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, four_columns, read_scan
+from gp_ground_seg.data.cloud_files import KITTI_COLUMNS, read_file
 from gp_ground_seg.data.files import naming, read_bytes
 
-UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70
-"""Classes that are neither ground nor obstacle."""
+UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70  # classes that are neither ground nor obstacle
 GROUND_CLASSES = (40, 44, 48, 49, 60, 72)
 """Road, parking, sidewalk, other ground, lane marking, terrain."""
 FRAME_PERIOD = 0.1  # time between frames [s] where a sequence has no times.txt
@@ -149,12 +148,8 @@ def _read_times(path: Path, frames: Sequence[Path]) -> list[float]:
 
 
 def read_points(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[np.float32]:
-    """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4).
-
-    Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
-    points, or can be no scan.
-    """
-    return four_columns(read_scan(path, columns))
+    """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4); DataError as `read_file`."""
+    return read_file(Path(path), columns).xyz.astype(np.float32, copy=False)
 
 
 def read_entries(path: str | Path, n_points: int) -> npt.NDArray[np.uint32]:

@@ -22,14 +22,8 @@ from typing import Any
 from tqdm import tqdm
 
 from gp_ground_seg import __version__
-from gp_ground_seg.core.errors import (
-    LOGGER,
-    DataError,
-    in_one_line,
-    log_once,
-    messages_passed_to,
-    require,
-)
+from gp_ground_seg.core import errors
+from gp_ground_seg.core.errors import DataError, require
 
 BLOCK_SIZE = 64
 """Items of a block, where there are enough for all workers: they share what a task costs."""
@@ -68,7 +62,7 @@ class Runner:
         """
         if self.client is None:
             return [function(items, partial(self.bar, total=len(items)))]
-        from distributed import as_completed
+        from distributed import KilledWorker, as_completed
 
         blocks = cut(items, group, self.n_workers)
         compute = partial(_compute_block, __version__, function)
@@ -76,26 +70,20 @@ class Runner:
         block_of, found = dict(zip(futures, blocks, strict=True)), {}
         with self.bar(total=len(items)) as bar:
             for future in as_completed(futures, loop=self.client.loop):
-                found[future], notes = _result_of(future, block_of[future])
+                block = block_of[future]
+                try:
+                    found[future], notes = future.result()
+                except CancelledError as error:
+                    raise DataError('the scheduler is lost') from error
+                except KilledWorker as error:
+                    raise DataError(
+                        f'{block[0]} to {block[-1]}: each worker that computed this block died, '
+                        'as where memory is short: fewer workers have more of it each'
+                    ) from error
                 for note in notes:
-                    log_once(*note)
-                bar.update(len(block_of[future]))
+                    errors.log_once(*note)
+                bar.update(len(block))
         return [found[future] for future in futures]
-
-
-def _result_of(future: Any, block: Sequence[Any]) -> Any:
-    """Return what `_compute_block` did; DataError if workers or the scheduler died."""
-    from distributed import KilledWorker
-
-    try:
-        return future.result()
-    except CancelledError as error:
-        raise DataError('the scheduler is lost') from error
-    except KilledWorker as error:
-        raise DataError(
-            f'{block[0]} to {block[-1]}: each worker that computed this block died, as where '
-            'memory is short: fewer workers have more of it each'
-        ) from error
 
 
 HERE = Runner()
@@ -123,7 +111,7 @@ def _compute_block(version: str, function: Function, block: Sequence[Any]) -> tu
             f'a worker on {platform.node()} has gp_ground_seg {__version__}, not {version}'
         )
     notes = _Notes()
-    with messages_passed_to(lambda *message: notes.append(message)):
+    with errors.messages_passed_to(lambda *message: notes.append(message)):
         return function(block, iter), notes
 
 
@@ -136,11 +124,17 @@ def open_runner(
     Raises DataError if the scheduler does not answer, MissingDependencyError without distributed.
     """
     if scheduler is not None:
-        with _connect(scheduler) as client:
-            LOGGER.info('dashboard: %s', client.dashboard_link)
+        distributed = _quiet_distributed()
+        try:  # with the keys of Dask's configuration
+            client = distributed.Client(scheduler, set_as_default=False, timeout=CONNECT_TIMEOUT)
+        except (OSError, ValueError, TypeError, MemoryError) as error:  # memory: no Dask is there
+            said = f'does not answer ({errors.in_one_line(error)})'
+            raise DataError(f'--scheduler {scheduler}: {said}') from error
+        with client:
+            errors.LOGGER.info('dashboard: %s', client.dashboard_link)
             n_workers = sum(client.nthreads().values())
             if not n_workers:
-                LOGGER.warning('the scheduler has no worker yet, waiting for one')
+                errors.LOGGER.warning('the scheduler has no worker yet, waiting for one')
             yield Runner(bar, client, n_workers)
     elif workers is not None:
         if workers > (most := 4 * (os.cpu_count() or 1)):
@@ -173,7 +167,11 @@ def _start_workers(n_workers: int) -> Iterator[Any]:
         'distributed.nanny.pre-spawn-environ': {},
     }
     with dask.config.set(settings):
-        with _ctrl_c_kept():
+        # Ctrl-C, which all processes of a terminal get, is kept from those of threads started
+        # here, which inherit the mask of signals; in this process it takes effect behind them.
+        resource_tracker.ensure_running()  # its start would change the mask
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
             cluster = distributed.LocalCluster(
                 n_workers=0,  # they start below: Ctrl-C does not wait for them
                 threads_per_worker=1,
@@ -184,6 +182,8 @@ def _start_workers(n_workers: int) -> Iterator[Any]:
                 silence_logs=logging.CRITICAL,
             )
             client = distributed.Client(cluster, set_as_default=False)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         with cluster, client:
             try:
                 cluster.scale(n_workers)
@@ -195,27 +195,3 @@ def _start_workers(n_workers: int) -> Iterator[Any]:
                 for process in {*multiprocessing.active_children()} - {*others}:
                     process.kill()
                 raise
-
-
-@contextmanager
-def _ctrl_c_kept() -> Iterator[None]:
-    """Keep Ctrl-C, which all processes of a terminal get, from those of threads started here.
-
-    They inherit the mask of signals. In this process it takes effect behind the block.
-    """
-    resource_tracker.ensure_running()  # its start would change the mask
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _connect(address: str) -> Any:
-    """Connect to a scheduler, with the keys of Dask's configuration."""
-    distributed = _quiet_distributed()
-    try:
-        return distributed.Client(address, set_as_default=False, timeout=CONNECT_TIMEOUT)
-    except (OSError, ValueError, TypeError, MemoryError) as error:  # memory: no Dask speaks there
-        text = f'--scheduler {address}: does not answer ({in_one_line(error)})'
-        raise DataError(text) from error

@@ -126,9 +126,6 @@ def find_difference(folder: Path, parameters: str) -> str:
     """Say where the `PARAMETERS` of a folder differ from these; empty if they do not."""
     path = folder / PARAMETERS
     before = read_bytes(path, 1 << 20).decode(errors='replace') if path.exists() else ''
-    for said, now in itertools.zip_longest(
-        before.splitlines(), parameters.splitlines(), fillvalue=''
-    ):
-        if said != now:
-            return f'{path}: says "{said}", now it is "{now}"'
-    return ''
+    lines = itertools.zip_longest(before.splitlines(), parameters.splitlines(), fillvalue='')
+    found = (f'{path}: says "{said}", now it is "{now}"' for said, now in lines if said != now)
+    return next(found, '')

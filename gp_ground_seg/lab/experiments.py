@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,38 +18,16 @@ from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config, find_preset
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.lab.cluster import HERE, Runner
-from gp_ground_seg.lab.scoring.evaluate import (
-    ALL,
-    PATCHWORKPP,
-    KnownScan,
-    Method,
-    OurMethod,
-    Scores,
-    load_kitti,
-    score_methods,
-    sums,
-)
+from gp_ground_seg.lab.scoring import evaluate, report, tables
+from gp_ground_seg.lab.scoring.evaluate import KnownScan, Method, OurMethod, Scores
 from gp_ground_seg.lab.scoring.metrics import ratio
 from gp_ground_seg.lab.scoring.objects import CLASSES, LOW_CLASSES, LOW_HEIGHTS, Objects
 from gp_ground_seg.lab.scoring.peers import INTERPOLATION, InterpolationMethod, PatchworkppMethod
-from gp_ground_seg.lab.scoring.report import COUNT, SIGNED, Form, Report, Table, frame_of
-from gp_ground_seg.lab.scoring.tables import (
-    MEASURES,
-    beside,
-    interval_note,
-    interval_text,
-    make_report,
-    measured,
-    peer_note,
-    time_tables,
-)
+from gp_ground_seg.lab.scoring.report import DataFrame, Form, Report, Table
 from gp_ground_seg.lab.simulation import LOW, PLACES, SCENES, SENSORS, STEEP, Kind, simulate_scan
 from gp_ground_seg.lab.simulation.objects import object_heights
 from gp_ground_seg.lab.simulation.scenes import DRIVES
 from gp_ground_seg.lab.table1 import table1
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 Changes = Mapping[str, Any]
 """Values of parameters, by dotted name."""
@@ -87,7 +65,7 @@ def simulated_frames(
 def load_scan(item: Frame | SimulatedFrame) -> KnownScan:
     """Read a labelled frame, or simulate: what the ray hit of the terrain is ground."""
     if isinstance(item, Frame):
-        return load_kitti(item)
+        return evaluate.load_kitti(item)
     scene, rng = SCENES[item.scene](item.seed), np.random.default_rng(item.seed)
     sensor = SENSORS[item.sensor]
     made = simulate_scan(scene, sensor, rng, x=item.x)
@@ -155,20 +133,20 @@ def score_variants(
 
     Return the scores, and the measures of each method over all scans.
     """
-    ours = [OurMethod(config, name) for name, config in variants.items()]
-    scores = score_methods(items, [*ours, *peers], load_scan, each_alone=True, runner=runner)
-    return scores, measured(scores.scans).reset_index()
+    methods = [*(OurMethod(config, name) for name, config in variants.items()), *peers]
+    scores = evaluate.score_methods(items, methods, load_scan, each_alone=True, runner=runner)
+    return scores, tables.measured(scores.scans).reset_index()
 
 
 def _differences(
     scores: Scores, name: str, pairs: Sequence[tuple[str, str]], prefix: str = ''
 ) -> dict[str, list[Any]]:
     """Columns of the difference of a measure of each pair of methods, and of its interval."""
-    measure, value = MEASURES[name], measured(scores.scans)[name]
+    measure, value = tables.MEASURES[name], tables.measured(scores.scans)[name]
     return {
         f'{prefix}difference': [value[a] - value[b] if a != b else None for a, b in pairs],
         f'{prefix}interval': [
-            interval_text(scores, b, measure, ours=a) if a != b else None for a, b in pairs
+            tables.interval_text(scores, b, measure, ours=a) if a != b else None for a, b in pairs
         ],
     }
 
@@ -193,23 +171,22 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     scores, models = score_variants(items, variants, [InterpolationMethod(config)], runner)
     pairs = [(ours, other) for _, _, ours, other in PAIRS]
-    rows = frame_of({
+    rows = report.frame_of({
         'pair': [title for title, *_ in PAIRS],
         'theta': [how for _, how, *_ in PAIRS],
         **_differences(scores, 'iou', pairs, 'iou_'),
         **_differences(scores, 'rmse', pairs, 'rmse_'),
     })  # fmt: skip
-    forms = {
-        'iou_difference': Form('IoU', *SIGNED), 'iou_interval': Form('IoU, 95 % interval'),
-        'rmse_difference': Form('RMSE', *SIGNED), 'rmse_interval': Form('RMSE, 95 % interval'),
-    }  # fmt: skip
+    names = 'IoU', 'RMSE'
+    forms = {f'{name.lower()}_difference': Form(name, *report.SIGNED) for name in names}
+    forms |= {f'{name.lower()}_interval': Form(f'{name}, 95 % interval') for name in names}
     of_pairs = (
         'Differences of IoU [%], where more is better, and of RMSE [cm], where less is; '
-        f'{interval_note(scores)}'
+        f'{tables.interval_note(scores)}'
     )
     models = models[['method', 'iou', 'rmse', 'median_absolute']]
-    tables = {'models': Table(_counted(scores), models), 'pairs': Table(of_pairs, rows, forms)}
-    return make_report(tables, scores, config)
+    parts = {'models': Table(_counted(scores), models), 'pairs': Table(of_pairs, rows, forms)}
+    return tables.make_report(parts, scores, config)
 
 
 def paper_steps(config: Config) -> dict[str, Config]:
@@ -237,9 +214,9 @@ def compare_steps(items: Sequence[Any], config: Config, runner: Runner = HERE) -
     table = table[['method', 'iou', 'difference', 'interval', 'rmse']]
     title = (
         f'{_counted(scores)}; difference to the row above, below the steps to the last of them; '
-        f'{interval_note(scores)}'
+        f'{tables.interval_note(scores)}'
     )
-    return make_report({'steps': Table(title, table)}, scores, config)
+    return tables.make_report({'steps': Table(title, table)}, scores, config)
 
 
 def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner = HERE) -> Report:
@@ -263,10 +240,10 @@ def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner =
     title = (
         f'{_counted(scores)}; candidates of a line for each pseudo-input; interval of the RMSE '
         f'minus that of the first row; n_L: pseudo-inputs of a segment, mean; time of a frame; '
-        f'{interval_note(scores)}'
+        f'{tables.interval_note(scores)}'
     )
     forms = {'method': Form('candidates'), 'n_pseudo_inputs': Form('n_L', '.1f')}
-    return make_report({'pseudo_inputs': Table(title, table, forms)}, scores, config)
+    return tables.make_report({'pseudo_inputs': Table(title, table, forms)}, scores, config)
 
 
 def measure_speed(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Report:
@@ -288,18 +265,18 @@ def measure_speed(items: Sequence[Frame], config: Config, runner: Runner = HERE)
         for name, mode in MODES.items()
     ]
     methods.insert(len(MODES), PatchworkppMethod.of_sensor(config.sensor))
-    scores = score_methods([*items] * N_PASSES, methods, _points_of, runner=runner)
+    scores = evaluate.score_methods(
+        [*items] * N_PASSES, methods,
+        # The points alone: what is not scored leaves the caches as they are.
+        lambda frame: KnownScan(frame.sequence, frame.index, frame.points), runner=runner,
+    )  # fmt: skip
     points = scores.scans['points']
     title = (
         f'Time per frame: {len(items)} frames, {N_PASSES} passes, reading left out; '
         f'{in_thousands(points.median())} points (median), at most {in_thousands(points.max())}'
     )
-    return make_report(time_tables(scores, PATCHWORKPP, title), scores, config)
-
-
-def _points_of(frame: Frame) -> KnownScan:
-    """Read the points alone: what is not scored leaves the caches as they are."""
-    return KnownScan(frame.sequence, frame.index, frame.points)
+    times = tables.time_tables(scores, evaluate.PATCHWORKPP, title)
+    return tables.make_report(times, scores, config)
 
 
 # Simulated scenes: ours beside Patchwork++, and objects lost.
@@ -321,12 +298,12 @@ def score_scenes(
     parameters. Low objects, and rough and steep ground, have tables of their own.
     """
     methods: list[Method] = [OurMethod(config), PatchworkppMethod()]
-    scores = score_methods(frames, methods, load_scan, each_alone=True, runner=runner)
-    tables = {'scenes': _scene_table(scores)}
+    scores = evaluate.score_methods(frames, methods, load_scan, each_alone=True, runner=runner)
+    parts = {'scenes': _scene_table(scores)}
     for name, make, scenes in (('low', _low_table, LOW), ('rough', _rough_table, ROUGH)):
         if own := [pair for pair in scores.sequences if pair.split()[1] in scenes]:
-            tables[name] = make(scores.of(own))
-    return make_report(tables, scores, config)
+            parts[name] = make(scores.of(own))
+    return tables.make_report(parts, scores, config)
 
 
 def _placed(table: DataFrame) -> DataFrame:
@@ -337,50 +314,50 @@ def _placed(table: DataFrame) -> DataFrame:
 
 def _scene_table(scores: Scores) -> Table:
     """One row for each sensor and scene: ground, height, objects lost."""
-    found = measured(scores.scans, 'sequence')[['iou', 'rmse']]
+    found = tables.measured(scores.scans, 'sequence')[['iou', 'rmse']]
     forms = dict[str, Form]()
     for kind, classes in COUNTED.items():
-        own = sums(scores.objects[scores.objects['class'].isin(classes)], 'sequence')
+        own = evaluate.sums(scores.objects[scores.objects['class'].isin(classes)], 'sequence')
         own = own.reindex(found.index, fill_value=0)
         found = found.assign(**{kind: own['n_objects'], f'lost_{kind}': own['n_lost']})
-        forms |= {kind: Form(kind, *COUNT), f'lost_{kind}': Form('lost', *COUNT)}
-    table = beside(found, scores).drop(columns='difference')
+        forms |= {kind: Form(kind, *report.COUNT), f'lost_{kind}': Form('lost', *report.COUNT)}
+    table = tables.beside(found, scores).drop(columns='difference')
     title = (
         'IoU of the ground against exact labels [%]; RMSE of the surface [cm]; vehicles, persons '
         'and cyclists, and those lost'
     )
-    title += peer_note(scores, ', which gets the true height and place of the sensor')
+    title += tables.peer_note(scores, ', which gets the true height and place of the sensor')
     return Table(title, _placed(table), forms)
 
 
 def _low_table(scores: Scores) -> Table:
     """Lay out the share of low things lost, by height; ours, then the peer."""
     low = scores.objects[scores.objects['class'].isin(LOW_CLASSES)]
-    by_class = sums(low, 'sequence', 'class')
+    by_class = evaluate.sums(low, 'sequence', 'class')
     shares = ratio(by_class['n_lost'], by_class['n_objects']).unstack('class')
-    things = sums(low, 'sequence')['n_objects'].to_frame('things')
+    things = evaluate.sums(low, 'sequence')['n_objects'].to_frame('things')
     found = things.join(shares.reindex(columns=[*LOW_CLASSES]))
     title = 'Low objects by height, in plain view 3 to 20 m away, and the share that is lost [%]'
     forms = {name: Form(name.removeprefix('low, '), '.0f', 100.0) for name in LOW_CLASSES}
-    forms['things'] = Form('objects', *COUNT)
-    return Table(title + peer_note(scores), _placed(beside(found, scores)), forms)
+    forms['things'] = Form('objects', *report.COUNT)
+    return Table(title + tables.peer_note(scores), _placed(tables.beside(found, scores)), forms)
 
 
 def _rough_table(scores: Scores) -> Table:
     """One row for each scene, over its sensors, and one for all."""
-    found = measured(scores.scans, 'sequence').reset_index()
+    found = tables.measured(scores.scans, 'sequence').reset_index()
     found['scene'] = found['sequence'].str.split().str[1]
     how = {'n_scans': 'sum', 'n_objects': 'sum', 'iou': 'mean', 'rmse': 'mean', 'n_lost': 'sum'}
     found = found.groupby(['method', 'scene'], sort=False).agg(how)
-    table = beside(found, scores)
+    table = tables.beside(found, scores)
     means = table.mean()
     means.update(table.filter(like='n_').sum())
-    table.loc[ALL] = means
+    table.loc[evaluate.ALL] = means
     title = (
         'Rough and steep ground, means over the sensors: IoU against exact labels [%]; RMSE of '
         'the surface [cm]; vehicles, persons and crates, and those lost'
     )
-    title += peer_note(scores, ', which gets the true height')
+    title += tables.peer_note(scores, ', which gets the true height')
     return Table(title, table.reset_index())
 
 

@@ -199,10 +199,9 @@ def plot_segment(
     for view, (above, below) in zip(views, panels.T, strict=True):
         name = f'{title}, {view.name}' if title and view is views[0] else view.name
         above.set_title(name, fontsize=12, loc='left', parse_math=False)
-        view.draw_points(above, truth)
-        view.draw_ground(above)
+        view.draw_ground(above, truth)
         view.draw_length_scale(below)
-    lows, highs = zip(*(view.heights_shown() for view in views), strict=True)
+    lows, highs = zip(*(view.heights for view in views), strict=True)
     panels[0, 0].set_xlim(0.0, max(view.reach for view in views))
     panels[0, 0].set_ylim(min(lows), max(highs))
     for axes in panels.flat:
@@ -237,17 +236,18 @@ class SegmentView:
         # What holds all candidates, or if none all points [m].
         r = own.r if len(own.r) else self.r
         self.reach = float(r.max()) + BEYOND if len(r) else float(grid.edges[-1])
+        # What holds the inliers, or if none the lower half of the points [m].
+        heights = own.z[own.inlier]
+        if not len(heights):
+            heights = np.quantile(self.z, (0.0, 0.5)) if len(self.z) else np.array([-2.0, 0.0])
+        self.heights = float(heights.min()) - BELOW, float(heights.max()) + ABOVE
 
-    def draw_points(self, axes: Any, truth: Labels | None) -> None:
-        """Draw points over range by label, and errors on them, if the true labels are known."""
-        own = None if truth is None else truth[self._inside]
-        for name, chosen in label_layers(self._result.label[self._inside], own)[1].items():
+    def draw_ground(self, axes: Any, truth: Labels | None = None) -> None:
+        """Draw the ground over points by label, with their errors if `truth` is known."""
+        own, true = self._own, None if truth is None else truth[self._inside]
+        for name, chosen in label_layers(self._result.label[self._inside], true)[1].items():
             look = {'color': COLOURS[name], 'label': name, 'zorder': 2}
             axes.plot(self.r[chosen], self.z[chosen], 'o', ms=3.6, mew=0, **look)
-
-    def draw_ground(self, axes: Any) -> None:
-        """Draw ground, lines and candidates over range."""
-        own = self._own
         low, high = own.mean - 2.0 * own.std, own.mean + 2.0 * own.std
         look = {'linewidth': 0.0, 'color': SURFACE_COLOUR, 'alpha': 0.15, 'zorder': 3}
         axes.fill_between(own.knots, low, high, label='surface ± 2 std', **look)
@@ -261,13 +261,6 @@ class SegmentView:
             label = f'candidates, {name}'
             axes.plot(own.r[chosen], own.z[chosen], 'o', label=label, **look)
         axes.set_ylabel('height z, sensor frame [m]')
-
-    def heights_shown(self) -> tuple[float, float]:
-        """Limits around the inliers, or if none the lower half of the points [m]."""
-        z = self._own.z[self._own.inlier]
-        if not len(z):
-            z = np.quantile(self.z, (0.0, 0.5)) if len(self.z) else np.array([-2.0, 0.0])
-        return float(z.min()) - BELOW, float(z.max()) + ABOVE
 
     def _draw_lines(self, axes: Any) -> None:
         """Draw each line over its extent, and the critical points where the next one begins."""

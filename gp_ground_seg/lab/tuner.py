@@ -22,13 +22,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import (
-    LOGGER,
-    DataError,
-    GroundSegError,
-    in_thousands,
-    require,
-)
+from gp_ground_seg.core import errors
+from gp_ground_seg.core.errors import DataError, require
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec
@@ -98,7 +93,7 @@ def open_server(port: int) -> Iterator[tuple[Any, str]]:
     with redirect_stdout(io.StringIO()), _guarded(token):
         server = viser.ViserServer(host=HOST, port=port, verbose=False)
     if port not in (0, server.get_port()):
-        LOGGER.warning('port %d is in use: %d instead', port, server.get_port())
+        errors.LOGGER.warning('port %d is in use: %d instead', port, server.get_port())
     server.initial_camera.position, server.initial_camera.look_at = CAMERA, TARGET
     try:
         yield server, f'http://{HOST}:{server.get_port()}/{token}'
@@ -117,7 +112,7 @@ def _guarded(token: str) -> Iterator[None]:
     viser calls; if a later viser does not call it, nothing is served.
     """
     module, is_guarded = require('websockets.asyncio.server', 'viser'), False
-    serve, silent = module.serve, LOGGER.getChild('websockets')
+    serve, silent = module.serve, errors.LOGGER.getChild('websockets')
     silent.setLevel(logging.CRITICAL)  # it logs a traceback for a page that sends nonsense
 
     def guarded(*args: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
@@ -260,19 +255,18 @@ class Tuner:
             control.on_update(lambda _event: self._changed.set())
 
     def _add_control(self, spec: ParameterSpec) -> Callable[[], Any]:
-        """Add the control of a parameter, and return what reads it."""
+        """Add the control of a parameter, and return what reads it.
+
+        A number has a slider, and a checkbox for `AUTO` if it has that.
+        """
         gui, now = self._server.gui, self._start[spec.name]
         hint = f'{spec.description} ({spec.accepted})'
-        if spec.type not in (bool, str):
-            return self._add_number(spec, hint)
-        words = {str(option).lower(): option for option in spec.choices or (False, True)}
-        shown = gui.add_dropdown(spec.name, list(words), initial_value=str(now).lower(), hint=hint)
-        self._watch(shown)
-        return lambda: words[shown.value]
-
-    def _add_number(self, spec: ParameterSpec, hint: str) -> Callable[[], Any]:
-        """Add a slider, and a checkbox for `AUTO` where a parameter has that."""
-        gui, now = self._server.gui, self._start[spec.name]
+        if spec.type in (bool, str):
+            words = {str(option).lower(): option for option in spec.choices or (False, True)}
+            first = str(now).lower()
+            shown = gui.add_dropdown(spec.name, list(words), initial_value=first, hint=hint)
+            self._watch(shown)
+            return lambda: words[shown.value]
         low, high, step = slider_range(spec, now)
         number = spec.type(0.5 * (low + high) if now == AUTO else now)
         title = f'{spec.name} [{spec.unit}]' if spec.unit else spec.name
@@ -331,7 +325,7 @@ def _tell(place: Any, action: Callable[[], str | None]) -> None:
     try:
         words = action()
     except Exception as error:
-        words = str(error) if isinstance(error, GroundSegError) else repr(error)
+        words = str(error) if isinstance(error, errors.GroundSegError) else repr(error)
     # Names and messages may come from a file.
     place.content = box(html.escape(words)) if words else ''
 
@@ -340,7 +334,7 @@ def _table(result: Segmentation, before: Labels, sums: Sequence[dict[str, Any]])
     """Numbers of a result and of labels before, and how many labels have changed."""
     both = result.label, before
     rows = {
-        word: [in_thousands(np.count_nonzero(label == value)) for label in both]
+        word: [errors.in_thousands(np.count_nonzero(label == value)) for label in both]
         for word, value in (('ground', Label.GROUND), ('obstacle', Label.OBSTACLE))
     }
     if 'tp' in sums[0]:
@@ -349,7 +343,7 @@ def _table(result: Segmentation, before: Labels, sums: Sequence[dict[str, Any]])
     rows['time'] = [f'{1e3 * result.timings["total"]:.0f} ms', '']
     is_ground = (result.label == Label.GROUND)[result.label != before]
     numbers = len(is_ground), int(is_ground.sum()), int((~is_ground).sum())
-    n_changed, n_ground, n_obstacle = map(in_thousands, numbers)
+    n_changed, n_ground, n_obstacle = map(errors.in_thousands, numbers)
     return '\n'.join(
         ['| | now | before |', '|---|--:|--:|',
          *(f'| {word} | {now} | {then} |' for word, (now, then) in rows.items()), '',

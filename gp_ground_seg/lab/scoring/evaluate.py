@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -27,10 +27,7 @@ from gp_ground_seg.lab.cluster import HERE, Progress, Runner
 from gp_ground_seg.lab.scoring import metrics, objects
 from gp_ground_seg.lab.scoring.metrics import COUNTS, Labels
 from gp_ground_seg.lab.scoring.objects import OBJECT_COUNTS, CutScan, Objects
-from gp_ground_seg.lab.scoring.report import frame_of, require_pandas
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from gp_ground_seg.lab.scoring.report import DataFrame, frame_of, require_pandas
 
 OURS = 'gp_ground_seg'
 PATCHWORKPP = 'Patchwork++'

@@ -20,10 +20,8 @@ from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
 from gp_ground_seg.data.semantic_kitti import VEGETATION
 from gp_ground_seg.lab.scoring.metrics import Labels
 
-MIN_HEIGHT = 0.3
-"""Height above the local ground from which on a return on an object counts [m]."""
-MIN_RETURNS = 10
-"""Such returns that an object needs to be counted: of fewer, half is chance."""
+MIN_HEIGHT = 0.3  # height above the local ground from which on a return on an object counts [m]
+MIN_RETURNS = 10  # such returns that an object needs to be counted: of fewer, half is chance
 
 CELL_SIZE = 0.5  # of the cells of ground that is known [m]
 N_CELLS = 5  # of them that make the local ground
@@ -32,8 +30,7 @@ MAX_GROUND_DISTANCE = 5.0  # to the farthest of them [m]
 LOW_HEIGHTS = (0.2, 0.3, 0.4, 0.5, 0.6)
 """Heights of low objects [m], each a class of its own, which only simulated scans have."""
 LOW_CLASSES = tuple(f'low, {height:g} m' for height in LOW_HEIGHTS)
-PLANTS = 'vegetation'
-"""Class of what is no object of its own: it is neither cut nor lost."""
+PLANTS = 'vegetation'  # class of what is no object of its own: it is neither cut nor lost
 CLASSES: dict[str, tuple[int, ...]] = {
     'vehicle': (10, 13, 16, 18, 20, 252, 256, 257, 258, 259),
     'person': (30, 254),
@@ -42,8 +39,7 @@ CLASSES: dict[str, tuple[int, ...]] = {
     **dict.fromkeys(LOW_CLASSES, ()),
 }
 """Classes of objects, by numbers of SemanticKITTI; two-wheelers with or without a rider."""
-LOW_MIN_HEIGHT, LOW_MIN_RETURNS = 0.1, 3
-"""`MIN_HEIGHT` [m] and `MIN_RETURNS` of `LOW_CLASSES`."""
+LOW_MIN_HEIGHT, LOW_MIN_RETURNS = 0.1, 3  # `MIN_HEIGHT` [m] and `MIN_RETURNS` of `LOW_CLASSES`
 
 CELLS = {'road_cells': (40, 44), 'ground_cells': (40, 44, 48, 49, 60)}
 """Classes of SemanticKITTI whose cells are counted."""
@@ -53,8 +49,7 @@ SHARES = {
     'ground_cells': 'cells of ground called obstacle',
 }
 """Shares that are counted, in words; of each the sums are ``NAME_n`` and ``NAME_wrong``."""
-CUT_HEIGHT = 0.45
-"""Height above the ground at which labelled objects are cut [m]."""
+CUT_HEIGHT = 0.45  # height above the ground at which labelled objects are cut [m]
 LOW_OVER, LOW_RANGE, LOW_N_GROUND = 0.15, 25.0, 5
 """A return on a cut object counts if it is more than so high above the ground [m], and nearer
 than this [m]; number of the nearest returns of ground whose median is that ground."""

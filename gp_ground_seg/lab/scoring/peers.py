@@ -16,14 +16,7 @@ from gp_ground_seg.core.errors import ConfigError, require
 from gp_ground_seg.core.frame import FloatArray, Frame, Label
 from gp_ground_seg.core.parameters.config import Config, SensorConfig
 from gp_ground_seg.core.parameters.schema import AUTO
-from gp_ground_seg.lab.scoring.evaluate import (
-    PATCHWORKPP,
-    KnownScan,
-    MethodResult,
-    Mount,
-    OurMethod,
-    Points,
-)
+from gp_ground_seg.lab.scoring import evaluate
 
 
 class PatchworkppMethod:
@@ -33,14 +26,14 @@ class PatchworkppMethod:
     where the sensor is in the cloud's frame. The default `sensor_height` [m] is that of KITTI.
     """
 
-    name = PATCHWORKPP
+    name = evaluate.PATCHWORKPP
     depends_on_past = True
 
     def __init__(
         self, sensor_height: float | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> None:
         self._module = require('pypatchworkpp', 'pypatchworkpp')
-        self._mount: Mount = sensor_height, origin
+        self._mount: evaluate.Mount = sensor_height, origin
         self.reset()
 
     @classmethod
@@ -61,7 +54,7 @@ class PatchworkppMethod:
         """Send a worker what to make it of."""
         return type(self), self._mount
 
-    def reset(self, scan: KnownScan | None = None) -> None:
+    def reset(self, scan: evaluate.KnownScan | None = None) -> None:
         """Start anew with its default thresholds, and the mount of the scan if that is known."""
         sensor_height, origin = (scan and scan.mount) or self._mount
         self._origin = np.array(origin)
@@ -72,7 +65,7 @@ class PatchworkppMethod:
             self._uprightness = float(parameters.uprightness_thr)
             self._estimator = self._module.patchworkpp(parameters)
 
-    def run(self, points: Points) -> None:
+    def run(self, points: evaluate.Points) -> None:
         """Segment a scan."""
         if self._origin.any():
             points = points.copy()
@@ -80,7 +73,7 @@ class PatchworkppMethod:
         self._points = points
         self._estimator.estimateGround(points)
 
-    def result(self) -> MethodResult:
+    def result(self) -> evaluate.MethodResult:
         """Labels, and the plane of the nearest upright patch: it has no other surface."""
         label = np.full(len(self._points), Label.OBSTACLE, dtype=np.uint8)
         label[self._estimator.getGroundIndices()] = Label.GROUND
@@ -89,13 +82,13 @@ class PatchworkppMethod:
         upright = np.abs(normal[:, 2]) > self._uprightness
         centre, normal = centre[upright], normal[upright]
         if not len(centre):
-            return MethodResult(label, np.full(len(label), np.nan))
+            return evaluate.MethodResult(label, np.full(len(label), np.nan))
         xy = self._points[:, :2].astype(np.float64)
         xy[~np.isfinite(xy).all(axis=1)] = np.nan
         _, nearest = KDTree(centre[:, :2]).query(np.nan_to_num(xy))
         centre, normal = centre[nearest], normal[nearest]
         fall = np.sum((xy - centre[:, :2]) * normal[:, :2], axis=1) / normal[:, 2]
-        return MethodResult(label, np.asarray(centre[:, 2] - fall + self._origin[2]))
+        return evaluate.MethodResult(label, np.asarray(centre[:, 2] - fall + self._origin[2]))
 
 
 @contextlib.contextmanager
@@ -118,7 +111,7 @@ MAX_SLOPE, TOLERANCE = 0.15, 0.1
 of six pairs on a third of the labelled frames."""
 
 
-class InterpolationMethod(OurMethod):
+class InterpolationMethod(evaluate.OurMethod):
     """Our method without a Gaussian process: lowest points joined by straight lines.
 
     Nothing is learned. Of each segment `ground_points` are interpolated; the surface is the median

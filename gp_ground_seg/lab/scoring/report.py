@@ -17,7 +17,9 @@ from gp_ground_seg.core.errors import require
 from gp_ground_seg.core.parameters.config import Config
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    from pandas import DataFrame as DataFrame
+else:  # pandas is optional
+    DataFrame = Any
 
 PEER = 'peer_'
 """Beginning of the names of columns of the other method."""

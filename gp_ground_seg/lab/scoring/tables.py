@@ -9,26 +9,15 @@ narrow than too wide.
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.lab.scoring import metrics, objects
+from gp_ground_seg.lab.scoring import metrics, objects, report
 from gp_ground_seg.lab.scoring.evaluate import ALL, KEYS, STAGE, Scores, sums
 from gp_ground_seg.lab.scoring.metrics import Measure, ratio, share
-from gp_ground_seg.lab.scoring.report import (
-    PEER,
-    SHARE,
-    Form,
-    Report,
-    Table,
-    records,
-    require_pandas,
-)
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from gp_ground_seg.lab.scoring.report import DataFrame, Form, Report, Table
 
 CONFIDENCE, N_DRAWS, SEED = 0.95, 10_000, 0
 N_BLOCKS, MIN_BLOCK = 10, 5
@@ -80,11 +69,7 @@ def clusters(scores: Scores) -> DataFrame:
 
 
 def interval_text(
-    scores: Scores,
-    other: str,
-    measure: Measure,
-    frame: DataFrame | None = None,
-    ours: str = '',
+    scores: Scores, other: str, measure: Measure, frame: DataFrame | None = None, ours: str = ''
 ) -> str | None:
     """Interval of a measure of ours, by default the first method, minus that of another.
 
@@ -135,10 +120,8 @@ def beside(found: DataFrame, scores: Scores) -> DataFrame:
     ours = found.loc[scores.methods[0]]
     if not scores.peer:
         return ours
-    both = ours.join(found.loc[scores.peer, found.columns.intersection(PEERS)].add_prefix(PEER))
-    both = both[[
-        column for name in ours for column in (name, f'{PEER}{name}') if column in both
-    ]]  # fmt: skip
+    theirs = found.loc[scores.peer].filter(PEERS).add_prefix(report.PEER)
+    both = ours.join(theirs).filter([part for name in ours for part in (name, report.PEER + name)])
     return both.assign(difference=both['iou'] - both['peer_iou']) if 'iou' in both else both
 
 
@@ -165,7 +148,7 @@ def measured(rows: DataFrame, *by: str) -> DataFrame:
 
 def make_report(tables: dict[str, Table], scores: Scores, config: Config) -> Report:
     """Report of scored variants of `config`; its rows are the scans, with sums and measures."""
-    rows = records(with_measures(scores.scans))
+    rows = report.records(with_measures(scores.scans))
     return Report(tables, rows, str(scores.scans['backend'].iloc[0]), config)
 
 
@@ -212,12 +195,7 @@ def evaluation(scores: Scores, config: Config) -> Report:
 
 
 def _grouped(
-    scores: Scores,
-    title: str,
-    frame: DataFrame,
-    by: str,
-    columns: list[str],
-    interval: str = '',
+    scores: Scores, title: str, frame: DataFrame, by: str, columns: list[str], interval: str = ''
 ) -> Table:
     """Lay out measures of the groups of a frame, and of all but for classes of objects.
 
@@ -225,7 +203,7 @@ def _grouped(
     """
     # The rows of all are each once more.
     parts = [frame] if by == 'class' else [frame, frame.assign(**{by: ALL})]
-    rows = require_pandas().concat(parts, ignore_index=True)
+    rows = report.require_pandas().concat(parts, ignore_index=True)
     found = measured(rows, by)
     if 'n_lost' in found:
         found['n_lost'] = found['n_lost'].where(found['n_objects'] > 0)
@@ -250,7 +228,7 @@ def difference_table(scores: Scores) -> Table:
     table['difference'] = table['given'] - table['peer']
     table['interval'] = [interval_text(scores, other, MEASURES[name]) for name in table.index]
     table = table.rename(index=COMPARED).reset_index(names='measure')
-    forms = {'given': Form('given', *SHARE), 'peer': Form(other, *SHARE)}
+    forms = {'given': Form('given', *report.SHARE), 'peer': Form(other, *report.SHARE)}
     title = f'Given minus {other}; {_changed_note(scores.scans, other)}; {interval_note(scores)}'
     return Table(title, table, forms)
 
@@ -278,22 +256,18 @@ def time_tables(
     runs = scans.assign(run=scans.groupby('method').cumcount())
     seconds = runs.pivot(index='run', columns='method', values='seconds')[scores.methods]
     table = seconds.median().to_frame('median').assign(p99=seconds.quantile(0.99))
-    forms = dict[str, Form]()
     if peer:
         table['ratio'] = seconds.div(seconds[peer], axis='index').median()
         table['p99_ratio'] = table['p99'] / table['median'][peer]
-        forms['ratio'] = Form(f'/ {peer}', '.2f')
-        forms['p99_ratio'] = Form(f'p99 / {peer} median', '.2f')
-    names = [name for name in scans if name.startswith(STAGE)]
-    ours = scans[scans[names].notna().any(axis='columns')]
-    stages = ours[names].assign(rest=ours['seconds'] - ours[names].sum(axis='columns'))
-    medians = stages.groupby(ours['method'], sort=False).median()
-    medians = medians.rename(columns=lambda name: name.removeprefix(STAGE))
+    forms = {'ratio': Form(f'/ {peer}', '.2f')}
+    forms['p99_ratio'] = Form(f'p99 / {peer} median', '.2f')
+    stages = scans.filter(regex=f'^{STAGE}').dropna(how='all')  # of ours
+    stages = stages.assign(rest=scans['seconds'] - stages.sum(axis='columns'))
+    stages = stages.rename(columns=lambda name: name.removeprefix(STAGE))
+    medians = stages.groupby(scans['method'], sort=False).median()
     of_stage = {name: Form(name, '.2f', 1e3) for name in medians}
+    of_stage['method'] = Form('stage, median [ms]')
     return {
         'times': Table(title, table.reset_index(), forms),
-        'stages': Table(
-            'Stages of a frame', medians.reset_index(),
-            {**of_stage, 'method': Form('stage, median [ms]')},
-        ),
-    }  # fmt: skip
+        'stages': Table('Stages of a frame', medians.reset_index(), of_stage),
+    }

@@ -29,28 +29,16 @@ Kind = IntEnum(
 """What a ray can hit."""
 
 
-# In order of the codes: class in SemanticKITTI, and share of the light that comes back.
-_CLASS_AND_REFLECTANCE: dict[Kind, tuple[int, float]] = {
-    Kind.TERRAIN: (40, 0.25),  # road
-    Kind.BOX: (10, 0.5),  # car
-    Kind.WALL: (50, 0.4),  # building
-    Kind.POLE: (80, 0.6),  # pole
-    Kind.OVERHANG: (52, 0.35),  # other structure; scored as an obstacle, unlike vegetation
-    Kind.REFLECTION: (1, 0.05),  # outlier
-    Kind.VEGETATION: (70, 0.3),  # vegetation
-    Kind.PERSON: (30, 0.3),  # person
-    Kind.CYCLIST: (31, 0.3),  # bicyclist
-}
+# By `Kind`: road, car, building, pole, other structure (an obstacle, which vegetation is not),
+# outlier, vegetation, person, bicyclist.
+_CLASSES = np.array([40, 10, 50, 80, 52, 1, 70, 30, 31], dtype=np.uint32)
+REFLECTANCE = np.array([0.25, 0.5, 0.4, 0.6, 0.35, 0.05, 0.3, 0.3, 0.3])
+"""Share of the light that each `Kind` sends back."""
 
 
 def semantic_kitti_labels(kind: KindArray) -> npt.NDArray[np.uint32]:
     """Class in SemanticKITTI of each `Kind` code, (N,) uint32, as ``.label`` files hold them."""
-    return np.array([label for label, _ in _CLASS_AND_REFLECTANCE.values()], dtype=np.uint32)[kind]
-
-
-def reflectance(kind: KindArray) -> npt.NDArray[np.float64]:
-    """Share of the light that each `Kind` code sends back, (N,) float64 in [0, 1]."""
-    return np.array([share for _, share in _CLASS_AND_REFLECTANCE.values()])[kind]
+    return np.asarray(_CLASSES[kind])
 
 
 @dataclass(frozen=True)

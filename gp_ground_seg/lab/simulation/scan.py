@@ -10,13 +10,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from gp_ground_seg.core.frame import FloatArray
-from gp_ground_seg.lab.simulation.objects import (
-    Kind,
-    KindArray,
-    nearest_solid,
-    number_objects,
-    reflectance,
-)
+from gp_ground_seg.lab.simulation import objects
+from gp_ground_seg.lab.simulation.objects import Kind, KindArray
 from gp_ground_seg.lab.simulation.scenes import Scene
 from gp_ground_seg.lab.simulation.terrain import Terrain, first_hit
 
@@ -99,15 +94,11 @@ def _beams(*blocks: tuple[float, float, int]) -> tuple[float, ...]:
 # Fields of view, ranges and accuracies are those of the makers' data sheets, columns those at
 # 10 turns a second. Heights are typical mounts: KITTI's car for the HDL-64E, nuScenes' roof for
 # the HDL-32E, field robots for the VLP-16 and the Mid-360.
-HDL_64E, HDL_32E, VLP_16, OS1_128 = (
-    SensorModel(name, _beams(*blocks), n_columns, nearest, farthest, range_std, height)
-    for name, blocks, n_columns, nearest, farthest, range_std, height in (
-        ('hdl-64e', ((2.0, -8.33, 32), (-8.83, -24.33, 32)), 2000, 0.9, 120.0, 0.02, 1.73),
-        ('hdl-32e', ((10.67, -30.67, 32),), 2170, 0.9, 100.0, 0.02, 1.84),
-        ('vlp-16', ((15.0, -15.0, 16),), 1800, 0.5, 100.0, 0.03, 0.8),
-        ('os1-128', ((22.5, -22.5, 128),), 1024, 0.8, 120.0, 0.015, 1.8),
-    )
-)
+_BLOCKS = (2.0, -8.33, 32), (-8.83, -24.33, 32)
+HDL_64E = SensorModel('hdl-64e', _beams(*_BLOCKS), 2000, 0.9, 120.0, 0.02, 1.73)
+HDL_32E = SensorModel('hdl-32e', _beams((10.67, -30.67, 32)), 2170, 0.9, 100.0, 0.02, 1.84)
+VLP_16 = SensorModel('vlp-16', _beams((15.0, -15.0, 16)), 1800, 0.5, 100.0, 0.03, 0.8)
+OS1_128 = SensorModel('os1-128', _beams((22.5, -22.5, 128)), 1024, 0.8, 120.0, 0.015, 1.8)
 MID_360 = ScatterModel(
     'mid-360', (math.radians(52.0), math.radians(-7.0)), 1, 0.1, 40.0, range_std=0.02, height=0.5
 )
@@ -220,13 +211,13 @@ def _cast(
     origin = np.broadcast_to(position, direction.shape)
 
     distance = first_hit(scene.terrain, origin, direction, sensor.max_range)
-    solid_distance, solid = nearest_solid(scene.solids, position, direction)
+    solid_distance, solid = objects.nearest_solid(scene.solids, position, direction)
     blocked = solid_distance < distance
     distance = np.where(blocked, solid_distance, distance)
     # The last row of each table is of rays that meet no solid.
     solid = np.where(blocked, solid, -1)
     kind = np.array([*(hit.kind for hit in scene.solids), Kind.TERRAIN], dtype=np.uint8)[solid]
-    object_id = np.append(number_objects(scene.solids), np.int32(0))[solid]
+    object_id = np.append(objects.number_objects(scene.solids), np.int32(0))[solid]
     _mirror(scene, origin, direction, distance, kind, mirror_draw)
 
     measured = distance + sensor.range_std * range_noise
@@ -235,7 +226,7 @@ def _cast(
     kind = kind[kept]
     points = np.empty((len(kept), 4), dtype=np.float32)
     points[:, :3] = beams[kept] * measured[kept, None] + start
-    points[:, 3] = np.clip(reflectance(kind) + 0.05 * intensity_noise[kept], 0.0, 1.0)
+    points[:, 3] = np.clip(objects.REFLECTANCE[kind] + 0.05 * intensity_noise[kept], 0.0, 1.0)
     return points, kind, object_id[kept]
 
 
@@ -265,7 +256,7 @@ def _mirror(
     normal = np.column_stack([-slope, np.ones(len(slope))])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     across = np.sum(direction[ray] * normal, axis=1, keepdims=True)
-    onward, _ = nearest_solid(scene.solids, foot, direction[ray] - 2.0 * across * normal)
+    onward, _ = objects.nearest_solid(scene.solids, foot, direction[ray] - 2.0 * across * normal)
     found = np.isfinite(onward)
     distance[ray[is_deep & ~found]] = np.inf
     ray, total = ray[found], distance[ray[found]] + onward[found]

@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 import gp_ground_seg.lab.simulation.objects as objects
+import gp_ground_seg.lab.simulation.terrain as landforms
 import gp_ground_seg.lab.simulation.traffic as traffic
 from gp_ground_seg.lab.scoring.objects import LOW_HEIGHTS
 from gp_ground_seg.lab.simulation.objects import Kind, Solid
-from gp_ground_seg.lab.simulation.terrain import (
-    Sum,
-    Terrain,
-    crest,
-    ditch,
-    flat,
-    kerb,
-    polyline,
-    ramp,
-    rough,
-    slope,
-    smooth_then_rough,
-)
+from gp_ground_seg.lab.simulation.terrain import Sum, Terrain, ditch, flat, polyline, ramp, rough
 
 N_SCATTERED, SCATTER_X, SCATTER_Y = 36, (-60.0, 100.0), (6.0, 35.0)
 """Scattered solids, and their distance from the drive [m], which leaves its lane free."""
@@ -37,10 +27,9 @@ LOW_DISTANCE, LOW_GAP = (3.0, 20.0), 0.03
 """Distance of the nearest corner of a low object [m], and angle between neighbours [rad]."""
 N_OF_EACH, APART = 4, 5.5
 """Cars, persons, crates, poles and walls around a vehicle, and least distance of two [m]."""
-CRATES = 0.4, 0.65
-"""Heights of the crates that are objects [m]."""
-ENDS = -15.0, -8.0, 8.0, 15.0
-"""Places of persons and crates along a valley or a dike [m]."""
+CRATES = 0.4, 0.65  # heights of the crates that are objects [m]
+ENDS = -15.0, -8.0, 8.0, 15.0  # places of persons and crates along a valley or a dike [m]
+LEANING = 'hills', 'on_ramp'  # scenes in which the vehicle leans with the ground
 BANKS = tuple(np.radians((15.0, 25.0, 35.0)).tolist())  # slopes of banks [rad]
 URBAN_X = (-80.0, 160.0)  # where the street of the urban scene begins and ends [m]
 
@@ -67,85 +56,76 @@ class Scene:
     leans: bool = False  # whether the vehicle leans with the ground under it, or is level
 
 
-def _scattered(terrain: Terrain, rng: np.random.Generator) -> tuple[Solid, ...]:
-    """Cars, trucks, crates, walls, poles and trees on both sides of the drive."""
-    solids: list[Solid] = []
+Parts = Iterator[Any]  # the terrain of a scene, then the solids on it and its wet patches
+
+
+def _open(make: Callable[[np.random.Generator], Terrain], rng: np.random.Generator) -> Parts:
+    """Terrain with cars, crates, walls, poles and trees on both sides of the drive."""
+    yield (terrain := make(rng))
     for k in range(N_SCATTERED):
         x = rng.uniform(*SCATTER_X)
         y = rng.uniform(*SCATTER_Y) * rng.choice([-1.0, 1.0])
         yaw = rng.uniform(0.0, 2.0 * math.pi)
         match k % 6:
             case 0 | 1:
-                solids += objects.car(terrain, x, y, yaw)
+                yield from objects.car(terrain, x, y, yaw)
             case 2:
-                solids.append(
-                    objects.standing_box(terrain, x, y, (0.8, 0.6, rng.uniform(0.3, 1.0)), yaw)
-                )
+                size = (0.8, 0.6, rng.uniform(0.3, 1.0))
+                yield objects.standing_box(terrain, x, y, size, yaw)
             case 3:
-                solids.append(objects.pole(terrain, x, y))
+                yield objects.pole(terrain, x, y)
             case 4:
-                solids += objects.tree(terrain, x, y)
+                yield from objects.tree(terrain, x, y)
             case _:
                 along = rng.uniform(4.0, 12.0)
-                solids += objects.wall(terrain, (x, y), (x + along, y), rng.uniform(1.0, 2.5))
-    return tuple(solids)
+                yield from objects.wall(terrain, (x, y), (x + along, y), rng.uniform(1.0, 2.5))
 
 
 _OPEN_COUNTRY: dict[str, Callable[[np.random.Generator], Terrain]] = {
     # Level ground.
     'flat': lambda rng: flat(),
     # Plane that rises or falls by 8 % in a random direction.
-    'slope': lambda rng: slope(0.08, rng.uniform(-math.pi, math.pi)),
+    'slope': lambda rng: landforms.slope(0.08, rng.uniform(-math.pi, math.pi)),
     # Level ground, then at once a climb of 12 %.
     'ramp': lambda rng: ramp(rng.uniform(12.0, 18.0), 0.12, rng.uniform(-0.3, 0.3)),
     # Waves of 2 to 20 m, 8 cm rms.
     'rough': rough,
     # Smooth road that ends in rubble: waves of 0.8 to 6 m, 15 cm rms.
-    'road_then_rubble': lambda rng: smooth_then_rough(rng, rng.uniform(14.0, 20.0), 3.0),
+    'road_then_rubble': lambda rng: landforms.smooth_then_rough(rng, rng.uniform(14.0, 20.0), 3.0),
     # Road between sidewalks 15 cm higher.
-    'kerb': lambda rng: kerb(rng.uniform(3.5, 5.0), 0.15),
+    'kerb': lambda rng: landforms.kerb(rng.uniform(3.5, 5.0), 0.15),
     # Ditch 1 m deep across the drive, at an angle.
     'ditch': lambda rng: ditch(rng.uniform(-0.5, 0.5), rng.uniform(10.0, 14.0), 4.0, 1.5, 1.0),
     # Hill of 8 % slopes with a rounded top that hides what is behind it.
-    'crest': lambda rng: crest(rng.uniform(8.0, 12.0), 15.0, 0.08, 12.0),
+    'crest': lambda rng: landforms.crest(rng.uniform(8.0, 12.0), 15.0, 0.08, 12.0),
 }
 
 
-def _open_scene(name: str, seed: int) -> Scene:
-    rng = np.random.default_rng(seed)
-    terrain = _OPEN_COUNTRY[name](rng)
-    return Scene(name, terrain, _scattered(terrain, rng))
-
-
-def _urban(seed: int) -> Scene:
+def _urban(rng: np.random.Generator) -> Parts:
     """Street: kerbs, parked cars, a truck, houses, awnings, poles, trees, a bridge, puddles."""
-    rng = np.random.default_rng(seed)
     road, front = 6.0, 10.0
-    terrain = kerb(road, 0.15)
-    solids: list[Solid] = []
-    wet: list[WetPatch] = []
+    yield (terrain := landforms.kerb(road, 0.15))
     for side in (-1.0, 1.0):
         x = URBAN_X[0]
         while x < URBAN_X[1]:
             house = rng.uniform(12.0, 25.0)
             ends = (x, side * front), (x + house, side * front)
-            solids += objects.wall(terrain, *ends, rng.uniform(4.0, 9.0))
+            yield from objects.wall(terrain, *ends, rng.uniform(4.0, 9.0))
             x += house + rng.uniform(2.0, 8.0)
         for x in np.arange(URBAN_X[0], URBAN_X[1], 9.0) + rng.uniform(0.0, 2.0):
             if rng.random() < 0.6:
-                solids += objects.car(terrain, x, side * (road - 1.1), rng.normal(0.0, 0.02))
-                wet.append(WetPatch(x + rng.uniform(-3.0, 3.0), side * 2.5, rng.uniform(0.8, 1.8)))
+                yield from objects.car(terrain, x, side * (road - 1.1), rng.normal(0.0, 0.02))
+                yield WetPatch(x + rng.uniform(-3.0, 3.0), side * 2.5, rng.uniform(0.8, 1.8))
         for x in np.arange(URBAN_X[0], URBAN_X[1], 22.0) + rng.uniform(0.0, 10.0):
-            solids.append(objects.pole(terrain, x, side * 7.0))
-            solids += objects.tree(terrain, x + 8.0, side * 8.0)
-    solids += objects.truck(terrain, rng.uniform(25.0, 35.0), 2.6, math.pi)
+            yield objects.pole(terrain, x, side * 7.0)
+            yield from objects.tree(terrain, x + 8.0, side * 8.0)
+    yield from objects.truck(terrain, rng.uniform(25.0, 35.0), 2.6, math.pi)
     # Low enough for the flat upper beams of an HDL-64E to meet it.
     deck = (5.0, 2.0 * front, 0.8)
-    solids.append(objects.floating_box(terrain, rng.uniform(40.0, 50.0), 0.0, deck, 2.8))
+    yield objects.floating_box(terrain, rng.uniform(40.0, 50.0), 0.0, deck, 2.8)
     for x in np.arange(URBAN_X[0], URBAN_X[1], 30.0) + rng.uniform(0.0, 20.0):
-        solids.append(objects.floating_box(terrain, x, front - 1.0, (6.0, 2.0, 0.2), 2.1))
-    solids.append(objects.standing_box(terrain, rng.uniform(10.0, 20.0), -8.0, (0.5, 0.5, 0.4)))
-    return Scene('urban', terrain, tuple(solids), tuple(wet))
+        yield objects.floating_box(terrain, x, front - 1.0, (6.0, 2.0, 0.2), 2.1)
+    yield objects.standing_box(terrain, rng.uniform(10.0, 20.0), -8.0, (0.5, 0.5, 0.4))
 
 
 @dataclass(frozen=True)
@@ -191,91 +171,79 @@ class _Line:
         return solids, free
 
 
-def _traffic_jam(seed: int) -> Scene:
+def _traffic_jam(rng: np.random.Generator) -> Parts:
     """Five lanes of waiting vehicles between kerbs, cyclists between them, persons who cross."""
-    rng = np.random.default_rng(seed)
-    terrain = kerb(8.2, 0.15)
-    solids: list[Solid] = []
+    yield (terrain := landforms.kerb(8.2, 0.15))
     with_truck = rng.choice([-1, 1])
     for lane in range(-2, 3):
         line = _Line(terrain, rng, 0.0, 3.2 * lane)
         nearest = 2.4 if lane == 0 else rng.uniform(-2.0, 1.0)
         if lane == with_truck:
             x, y = line.at(nearest + 5.5)
-            solids += traffic.vehicle(terrain, 'truck', x, y)
+            yield from traffic.vehicle(terrain, 'truck', x, y)
         ahead = nearest + 9.9 if lane == with_truck else nearest
         turned = math.pi if lane == 2 else 0.0
         for ends in ((ahead, 70.0), (-abs(nearest), -60.0)):
             made, gaps = line.fill(ends, (1.2, 3.0), turned)
-            solids += made
+            yield from made
             for along in gaps[1:]:
                 if rng.random() < 0.12:
-                    solids += traffic.person(terrain, *line.at(along, rng.uniform(-1.0, 1.0)))
+                    yield from traffic.person(terrain, *line.at(along, rng.uniform(-1.0, 1.0)))
         if lane < 2:
             for x in rng.uniform((-25.0, 3.0), (-3.0, 25.0)).tolist():
-                solids += traffic.cyclist(terrain, x, 3.2 * lane + 1.6)
+                yield from traffic.cyclist(terrain, x, 3.2 * lane + 1.6)
     for side in (-1.0, 1.0):
-        solids += objects.wall(terrain, (-60.0, side * 13.0), (70.0, side * 13.0), 7.0)
+        yield from objects.wall(terrain, (-60.0, side * 13.0), (70.0, side * 13.0), 7.0)
         for x in np.arange(-25.0, 25.0, 10.0) + rng.uniform(0.0, 8.0):
-            solids += traffic.person(terrain, x, side * rng.uniform(9.0, 12.0))
-    return Scene('traffic_jam', terrain, tuple(solids))
+            yield from traffic.person(terrain, x, side * rng.uniform(9.0, 12.0))
 
 
-def _car_park(seed: int) -> Scene:
+def _car_park(rng: np.random.Generator) -> Parts:
     """Rows of parked cars, 0.6 to 1 m apart, along aisles 6 m wide with persons in them."""
-    rng = np.random.default_rng(seed)
-    terrain = slope(rng.uniform(0.0, 0.02), rng.uniform(-math.pi, math.pi))
-    solids: list[Solid] = []
+    yield (terrain := landforms.slope(rng.uniform(0.0, 0.02), rng.uniform(-math.pi, math.pi)))
     for aside, side in itertools.product((5.5, 10.6, 21.5, 26.6), (-1.0, 1.0)):
         line = _Line(terrain, rng, 0.0, side * aside)
         turned = rng.choice([-1.0, 1.0]) * math.pi / 2.0
-        solids += line.fill((-45.0, 55.0), (0.6, 1.0), turned, CARS, share=0.88)[0]
+        yield from line.fill((-45.0, 55.0), (0.6, 1.0), turned, CARS, share=0.88)[0]
     for x in (-12.0, -7.5, 3.0, 7.5, 12.0, 16.5, 21.0, 25.5):
         place = x + rng.uniform(0.0, 3.0), rng.uniform(-2.6, 2.6)
-        solids += traffic.person(terrain, *place)
-    return Scene('car_park', terrain, tuple(solids))
+        yield from traffic.person(terrain, *place)
 
 
-def _hidden_climb(seed: int) -> Scene:
+def _hidden_climb(rng: np.random.Generator) -> Parts:
     """Parked cars in a row, and right behind it a street that climbs by 10 to 15 %."""
-    rng = np.random.default_rng(seed)
     heading, near = rng.uniform(-math.pi, math.pi), rng.uniform(4.5, 6.5)
     foot, gradient = near + rng.uniform(1.5, 2.5), rng.uniform(0.1, 0.15)
-    terrain = polyline(heading, [(foot, 0.0), (foot + 50.0, 50.0 * gradient)])
+    yield (terrain := polyline(heading, [(foot, 0.0), (foot + 50.0, 50.0 * gradient)]))
     row = _Line(terrain, rng, heading - math.pi / 2.0, near)
-    solids, _ = row.fill((-28.0, 34.0), (0.6, 1.2), models=CARS)
+    yield from row.fill((-28.0, 34.0), (0.6, 1.2), models=CARS)[0]
     for k in range(10):
         beside = 4.0 * k - 18.0 + rng.uniform(-0.7, 0.7)
         place = row.at(beside, foot - near + rng.uniform(8.0, 35.0))
         if k % 2:
-            solids += traffic.person(terrain, *place)
+            yield from traffic.person(terrain, *place)
         else:
             name, yaw = str(rng.choice(CARS)), heading + rng.normal(0.0, 0.1)
-            solids += traffic.vehicle(terrain, name, *place, yaw)
-    return Scene('hidden_climb', terrain, tuple(solids))
+            yield from traffic.vehicle(terrain, name, *place, yaw)
 
 
-def _wet_road(seed: int) -> Scene:
+def _wet_road(rng: np.random.Generator) -> Parts:
     """Traffic jam in the rain: of the near returns of ground a third is missing or mirrored."""
-    dry = _traffic_jam(seed)
-    return Scene('wet_road', dry.terrain, dry.solids, (WetPatch(0.0, 0.0, 20.0, 0.35, True),))
+    yield from _traffic_jam(rng)
+    yield WetPatch(0.0, 0.0, 20.0, 0.35, True)
 
 
-def _blind_slope(seed: int) -> Scene:
+def _blind_slope(rng: np.random.Generator) -> Terrain:
     """Slope of 10 to 15 % around a level place 2 to 3 m wide: it begins in the blind spot."""
-    rng = np.random.default_rng(seed)
     gradient, half = rng.uniform(0.1, 0.15), rng.uniform(1.0, 1.5)
     rise = 40.0 * gradient
     corners = [(-half - 40.0, -rise), (-half, 0.0), (half, 0.0), (half + 40.0, rise)]
-    terrain = polyline(rng.uniform(-math.pi, math.pi), corners)
-    return Scene('blind_slope', terrain, _scattered(terrain, rng))
+    return polyline(rng.uniform(-math.pi, math.pi), corners)
 
 
-def _hedge(seed: int) -> Scene:
+def _hedge(rng: np.random.Generator) -> Parts:
     """Path between dense hedges 0.5 to 0.8 m high, with a fence behind one of them."""
-    rng = np.random.default_rng(seed)
-    terrain = rough(rng, 0.02, (1.5, 10.0))
-    solids: list[Solid] = []
+    yield (terrain := rough(rng, 0.02, (1.5, 10.0)))
     side = rng.choice([-1.0, 1.0])
     for y in (side * rng.uniform(3.0, 6.0), -side * rng.uniform(3.0, 6.0)):
         high, deep = rng.uniform(0.55, 0.75), rng.uniform(0.6, 1.2)
@@ -283,15 +251,14 @@ def _hedge(seed: int) -> Scene:
             # Leaves stick out by some centimetres.
             size = (0.27, deep + rng.uniform(-0.15, 0.15), high + rng.uniform(-0.05, 0.05))
             at = x, y + rng.uniform(-0.05, 0.05)
-            solids.append(objects.standing_box(terrain, *at, size, kind=Kind.VEGETATION))
+            yield objects.standing_box(terrain, *at, size, kind=Kind.VEGETATION)
     fence = side * rng.uniform(8.0, 10.0)
     for x in np.arange(-40.0, 60.0, 2.0).tolist():
-        solids.append(objects.pole(terrain, x, fence, 1.3, 0.05))
+        yield objects.pole(terrain, x, fence, 1.3, 0.05)
         for clearance in (0.52, 0.82, 1.12):
             rail = objects.floating_box(terrain, x + 1.0, fence, (2.0, 0.04, 0.12), clearance)
-            solids.append(rail)
-    solids += traffic.person(terrain, rng.uniform(5.0, 15.0), rng.uniform(-1.0, 1.0))
-    return Scene('hedge', terrain, tuple(solids))
+            yield rail
+    yield from traffic.person(terrain, rng.uniform(5.0, 15.0), rng.uniform(-1.0, 1.0))
 
 
 def _around(
@@ -300,16 +267,15 @@ def _around(
     rng: np.random.Generator,
     reach: tuple[float, float],
     places: Sequence[tuple[float, float]] = (),
-) -> tuple[Solid, ...]:
+) -> Iterator[Solid]:
     """Cars, persons, crates, poles and walls on `terrain`, in a `reach` [m] from the origin.
 
     Cars are where `smooth`, the terrain without its small waves, is even, and lean with it. There
     are a person and a crate in turns at `places` (x, y) [m] as well.
     """
-    solids: list[Solid] = []
     for k, place in enumerate(places):
         crate = objects.crate(terrain, *place, rng.uniform(*CRATES))
-        solids += crate if k % 2 else traffic.person(terrain, *place)
+        yield from crate if k % 2 else traffic.person(terrain, *place)
     taken = [*places]
     while (k := len(taken) - len(places)) < 5 * N_OF_EACH:
         away, bearing, yaw = rng.uniform(*reach), *rng.uniform(-math.pi, math.pi, 2)
@@ -320,130 +286,138 @@ def _around(
             case 0:
                 if not traffic.is_even(smooth, x, y):
                     continue
-                solids += traffic.vehicle(smooth, str(rng.choice(CARS)), x, y, yaw)
+                yield from traffic.vehicle(smooth, str(rng.choice(CARS)), x, y, yaw)
             case 1:
-                solids += traffic.person(terrain, x, y)
+                yield from traffic.person(terrain, x, y)
             case 2:
-                solids += objects.crate(terrain, x, y, rng.uniform(*CRATES), yaw)
+                yield from objects.crate(terrain, x, y, rng.uniform(*CRATES), yaw)
             case 3:
-                solids.append(objects.pole(terrain, x, y))
+                yield objects.pole(terrain, x, y)
             case _:
                 dx, dy = 2.5 * math.cos(yaw), 2.5 * math.sin(yaw)
                 ends = (x - dx, y - dy), (x + dx, y + dy)
-                solids += objects.wall(terrain, *ends, rng.uniform(1.0, 2.5))
+                yield from objects.wall(terrain, *ends, rng.uniform(1.0, 2.5))
         taken.append((x, y))
-    return tuple(solids)
 
 
-def _hills(seed: int) -> Scene:
+def _hills(rng: np.random.Generator) -> Parts:
     """Waves of 14 to 45 m, 0.9 m rms, and of 1 to 5 m, 4 cm rms, on which the vehicle leans."""
-    rng = np.random.default_rng(seed)
     smooth = rough(rng, 0.9, (14.0, 45.0))
-    terrain = Sum((smooth, rough(rng, 0.04, (1.0, 5.0))))
-    solids = _around(smooth, terrain, rng, (6.0, 32.0))
-    return Scene('hills', terrain, solids, leans=True)
+    yield (terrain := Sum((smooth, rough(rng, 0.04, (1.0, 5.0)))))
+    yield from _around(smooth, terrain, rng, (6.0, 32.0))
 
 
-def _valley(seed: int) -> Scene:
+def _valley(rng: np.random.Generator) -> Parts:
     """Level floor 6 to 10 m wide between sides of 15 to 25 degrees that are 6 m high."""
-    rng = np.random.default_rng(seed)
     floor, gradient = rng.uniform(3.0, 5.0), math.tan(math.radians(rng.uniform(15.0, 25.0)))
     top = floor + 6.0 / gradient
     corners = [(-top, 6.0), (-floor, 0.0), (floor, 0.0), (top, 6.0)]
     heading = rng.uniform(-math.pi, math.pi)
     smooth = polyline(heading, corners)
-    terrain = Sum((smooth, rough(rng, 0.03, (1.0, 6.0))))
+    yield (terrain := Sum((smooth, rough(rng, 0.03, (1.0, 6.0)))))
     along = _Line(terrain, rng, heading - 0.5 * math.pi, 0.0)
     places = [along.at(k, rng.uniform(-0.6, 0.6) * floor) for k in ENDS]
-    return Scene('valley', terrain, _around(smooth, terrain, rng, (6.0, 24.0), places))
+    yield from _around(smooth, terrain, rng, (6.0, 24.0), places)
 
 
-def _bank(seed: int) -> Scene:
-    """Bank of 15, 25 or 35 degrees, 2.5 to 4.5 m high, with persons and crates on it."""
-    rng = np.random.default_rng(seed)
-    heading, gradient = rng.uniform(-math.pi, math.pi), math.tan(BANKS[seed % len(BANKS)])
+def _bank(slope: float, rng: np.random.Generator) -> Parts:
+    """Bank of a slope [rad], 2.5 to 4.5 m high, with persons and crates on it."""
+    heading, gradient = rng.uniform(-math.pi, math.pi), math.tan(slope)
     foot, rise = rng.uniform(9.0, 14.0), rng.uniform(2.5, 4.5)
     depth = rise / gradient
     smooth = polyline(heading, [(foot, 0.0), (foot + depth, rise)])
-    terrain = Sum((smooth, rough(rng, 0.02, (1.0, 8.0))))
+    yield (terrain := Sum((smooth, rough(rng, 0.02, (1.0, 8.0)))))
     middle = _Line(terrain, rng, heading - 0.5 * math.pi, foot + 0.5 * depth)
     places = [middle.at(k, rng.uniform(-0.25, 0.25) * depth) for k in (-10.0, -3.5, 3.5, 10.0)]
-    return Scene('bank', terrain, _around(smooth, terrain, rng, (6.0, 32.0), places))
+    yield from _around(smooth, terrain, rng, (6.0, 32.0), places)
 
 
-def _on_ramp(seed: int) -> Scene:
+def _on_ramp(rng: np.random.Generator) -> Parts:
     """Ramp of 15 to 25 %, 9 to 17 m long, between level ground; the vehicle stands on it."""
-    rng = np.random.default_rng(seed)
     gradient, behind, ahead = rng.uniform((0.15, 4.0, 5.0), (0.25, 8.0, 9.0)).tolist()
     corners = [(-behind, -gradient * behind), (ahead, gradient * ahead)]
     smooth = polyline(rng.uniform(-math.pi, math.pi), corners)
-    terrain = Sum((smooth, rough(rng, 0.01, (1.0, 8.0))))
-    solids = _around(smooth, terrain, rng, (6.0, 28.0))
-    return Scene('on_ramp', terrain, solids, leans=True)
+    yield (terrain := Sum((smooth, rough(rng, 0.01, (1.0, 8.0)))))
+    yield from _around(smooth, terrain, rng, (6.0, 28.0))
 
 
-def _dike(seed: int) -> Scene:
+def _dike(rng: np.random.Generator) -> Parts:
     """Dike 5 to 8 m wide, 1 to 2 m above the ground on both sides; the vehicle stands on it."""
-    rng = np.random.default_rng(seed)
     heading, gradient = rng.uniform(-math.pi, math.pi), rng.uniform(0.4, 0.7)
     half, high = rng.uniform(2.5, 4.0), rng.uniform(1.0, 2.0)
     foot = half + high / gradient
     smooth = polyline(heading, [(-foot, -high), (-half, 0.0), (half, 0.0), (foot, -high)])
-    terrain = Sum((smooth, rough(rng, 0.02, (1.0, 8.0))))
+    yield (terrain := Sum((smooth, rough(rng, 0.02, (1.0, 8.0)))))
     along = _Line(terrain, rng, heading - 0.5 * math.pi, 0.0)
     places = [along.at(k, rng.uniform(-0.6, 0.6) * half) for k in ENDS]
-    return Scene('dike', terrain, _around(smooth, terrain, rng, (6.0, 32.0), places))
+    yield from _around(smooth, terrain, rng, (6.0, 32.0), places)
 
 
-def _low_box(rng: np.random.Generator) -> tuple[Kind, objects.Size]:
-    """Box, half of them 0.44 m wide, the others up to 2 m by 2 m."""
+def _low_box(rng: np.random.Generator) -> objects.Size:
+    """Size of a box, half of them 0.44 m wide, the others up to 2 m by 2 m."""
     length, width = rng.uniform(0.8, 2.0, 2) if rng.random() < 0.5 else (0.44, 0.44)
-    return Kind.BOX, (length, width, float(rng.choice(LOW_HEIGHTS)))
+    return length, width, float(rng.choice(LOW_HEIGHTS))
 
 
-_LOW_OBJECTS: dict[str, tuple[Callable[[np.random.Generator], tuple[Kind, objects.Size]], str]] = {
-    'low_boxes': (_low_box, 'flat'),
-    'low_boxes_rough': (_low_box, 'rough'),
-    'lying_persons': (lambda rng: (Kind.PERSON, (1.7, 0.45, 0.22)), 'flat'),
-}
-
-
-def _low_scene(name: str, seed: int) -> Scene:
+def _low(
+    ground: str,
+    kind: Kind,
+    size: Callable[[np.random.Generator], objects.Size],
+    rng: np.random.Generator,
+) -> Parts:
     """Low objects all around the sensor, turned at random, each in plain view."""
-    rng = np.random.default_rng(seed)
-    make, ground = _LOW_OBJECTS[name]
-    terrain = _OPEN_COUNTRY[ground](rng)
-    solids: list[Solid] = []
+    yield (terrain := _OPEN_COUNTRY[ground](rng))
     start = bearing = rng.uniform(-math.pi, math.pi)
     while True:
-        kind, (length, width, height) = make(rng)
+        length, width, height = size(rng)
         turned = rng.uniform(-1.0, 1.0) * (0.5 * math.pi)
         cos, sin, near = math.cos(turned), abs(math.sin(turned)), rng.uniform(*LOW_DISTANCE)
         half = math.atan2(0.5 * (length * cos + width * sin), near)
         if bearing + 2.0 * half + LOW_GAP > start + 2.0 * math.pi:
-            return Scene(name, terrain, tuple(solids))
+            return
         middle, away = bearing + half, near + 0.5 * (length * sin + width * cos)
         x, y, yaw = away * math.cos(middle), away * math.sin(middle), middle + 0.5 * math.pi
         box = objects.standing_box(terrain, x, y, (length, width, height), yaw + turned, kind)
-        solids += objects.parts_of(x, y, [box])
+        yield from objects.parts_of(x, y, [box])
         bearing += 2.0 * half + LOW_GAP
 
 
-Build = Callable[[int], Scene]
-"""Makes a scene of a seed."""
-DRIVES: dict[str, Build] = {
-    **{name: functools.partial(_open_scene, name) for name in _OPEN_COUNTRY},
-    'urban': _urban,
-}
+def _build(name: str, make: Callable[[np.random.Generator], Parts], seed: int) -> Scene:
+    """Make a scene of a seed."""
+    terrain, *parts = make(np.random.default_rng(seed))
+    solids = tuple(part for part in parts if isinstance(part, Solid))
+    wet = tuple(part for part in parts if isinstance(part, WetPatch))
+    return Scene(name, terrain, solids, wet, name in LEANING)
+
+
+def _named(**makers: Callable[[np.random.Generator], Parts]) -> dict[str, Callable[[int], Scene]]:
+    """Functions of a seed, by the names of their scenes."""
+    return {name: partial(_build, name, make) for name, make in makers.items()}
+
+
+DRIVES = _named(
+    **{name: partial(_open, make) for name, make in _OPEN_COUNTRY.items()}, urban=_urban
+)
 """Scenes whose lane along x is free, by name."""
-LOW: dict[str, Build] = {name: functools.partial(_low_scene, name) for name in _LOW_OBJECTS}
+LOW = _named(
+    low_boxes=partial(_low, 'flat', Kind.BOX, _low_box),
+    low_boxes_rough=partial(_low, 'rough', Kind.BOX, _low_box),
+    lying_persons=partial(_low, 'flat', Kind.PERSON, lambda rng: (1.7, 0.45, 0.22)),
+)
 """Scenes of low objects."""
-STEEP = {'hills': _hills, 'valley': _valley, 'bank': _bank, 'on_ramp': _on_ramp, 'dike': _dike}
+STEEP = {
+    **_named(hills=_hills, valley=_valley),
+    # Seeds take turns with the slopes.
+    'bank': lambda seed: _build('bank', partial(_bank, BANKS[seed % len(BANKS)]), seed),
+    **_named(on_ramp=_on_ramp, dike=_dike),
+}
 """Scenes of steep ground."""
 PLACES = {
-    'traffic_jam': _traffic_jam, 'car_park': _car_park, 'hidden_climb': _hidden_climb,
-    'wet_road': _wet_road, 'blind_slope': _blind_slope, 'hedge': _hedge, **LOW, **STEEP,
+    **_named(
+        traffic_jam=_traffic_jam, car_park=_car_park, hidden_climb=_hidden_climb,
+        wet_road=_wet_road, blind_slope=partial(_open, _blind_slope), hedge=_hedge,
+    ),
+    **LOW, **STEEP,
 }  # fmt: skip
 """All scenes around a sensor at the origin."""
-SCENES = {**DRIVES, **PLACES}
-"""All scenes by name."""
+SCENES = {**DRIVES, **PLACES}  # all scenes by name

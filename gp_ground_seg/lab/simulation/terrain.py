@@ -107,20 +107,14 @@ class Waves(Terrain):
     def along(self, at: FloatArray, direction: FloatArray, piece: OptionalArray = None) -> Along:
         """See `Terrain.along`."""
         factor, factor_slope, _ = self.envelope.along(at, direction, piece)
-        (x, y), (dx, dy) = at.T, direction.T
-        sums = np.zeros((4, len(at)))
-        waves = zip(self.wave_vectors, self.amplitudes, self.phases, strict=True)
-        for (kx, ky), amplitude, phase in waves:
-            angle = kx * x + ky * y + phase
-            rate = kx * dx + ky * dy
-            sums += (
-                amplitude * np.sin(angle),
-                amplitude * rate * np.cos(angle),
-                np.abs(amplitude * rate),
-                np.abs(amplitude) * rate**2,
-            )
-        # Height, slope, and bounds of the sizes of slope and bend, where the envelope is one.
-        height, slope, slope_bound, bend_bound = sums
+        (x, y), (dx, dy), (kx, ky) = at.T, direction.T, self.wave_vectors.T[:, :, None]
+        angle, rate = kx * x + ky * y + self.phases[:, None], kx * dx + ky * dy  # (n, R)
+        amplitude = self.amplitudes[:, None]
+        # Wave by wave, where the envelope is one; with bounds of the sizes of slope and bend.
+        height = sum(amplitude * np.sin(angle))
+        slope = sum(amplitude * rate * np.cos(angle))
+        slope_bound = sum(np.abs(amplitude * rate))
+        bend_bound = sum(np.abs(amplitude) * rate**2)
         index = self.envelope.piece_index(at if piece is None else piece)
         return Along(
             factor * height,

@@ -11,15 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray
-from gp_ground_seg.lab.simulation.objects import (
-    SMALLEST_RATE,
-    Interval,
-    Kind,
-    Solid,
-    floating_box,
-    parts_of,
-    upright,
-)
+from gp_ground_seg.lab.simulation import objects
+from gp_ground_seg.lab.simulation.objects import Interval, Kind, Solid
 from gp_ground_seg.lab.simulation.terrain import Terrain
 
 Corners = tuple[tuple[float, float], ...]
@@ -34,7 +27,7 @@ class Hull(Solid):
 
     def _outline(self, offset: FloatArray, rate: FloatArray) -> list[Interval]:
         outward = self.normals @ rate.T
-        outward[np.abs(outward) < SMALLEST_RATE] = SMALLEST_RATE
+        outward[np.abs(outward) < objects.SMALLEST_RATE] = objects.SMALLEST_RATE
         at = (self.limits[:, None] - self.normals @ offset.T) / outward
         leaves = outward > 0.0
         enter, leave = np.where(leaves, -np.inf, at), np.where(leaves, at, np.inf)
@@ -114,7 +107,7 @@ def vehicle(
         circle = tuple((axle + r * math.cos(t), r + r * math.sin(t)) for t in turns.tolist())
         aside = side * 0.5 * (model.width - WHEEL_WIDTH - 0.04)
         parts.append(_extruded(terrain, (x, y, yaw), circle, WHEEL_WIDTH, aside))
-    return parts_of(x, y, parts)
+    return objects.parts_of(x, y, parts)
 
 
 def _extruded(
@@ -145,13 +138,14 @@ def _extruded(
 def person(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
     """Person 1.7 m tall: legs, trunk and head."""
     parts = (0.0, 0.85, 0.13), (0.8, 1.45, 0.22), (1.4, 1.7, 0.1)
-    return parts_of(x, y, (upright(terrain, Kind.PERSON, (x, y), *part) for part in parts))
+    body = [objects.upright(terrain, Kind.PERSON, (x, y), *part) for part in parts]
+    return objects.parts_of(x, y, body)
 
 
 def cyclist(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
     """Cyclist 1.75 m tall: the bicycle, legs, trunk and head."""
     sizes = (0.0, (1.7, 0.06, 0.68)), (0.3, (0.5, 0.32, 0.65))
-    boxes = [floating_box(terrain, x, y, size, low, Kind.CYCLIST) for low, size in sizes]
+    boxes = [objects.floating_box(terrain, x, y, size, low, Kind.CYCLIST) for low, size in sizes]
     parts = ((0.9, 1.5, 0.2), (1.45, 1.75, 0.11))
-    rider = [upright(terrain, Kind.CYCLIST, (x, y), *part) for part in parts]
-    return parts_of(x, y, (*boxes, *rider))
+    rider = [objects.upright(terrain, Kind.CYCLIST, (x, y), *part) for part in parts]
+    return objects.parts_of(x, y, (*boxes, *rider))
