@@ -8,13 +8,14 @@ a sector is the ground that the robot stands on: the last drop before it is a fa
 No slope explains a fall if the ground before and behind it does not go down, and if it stands out
 from the roughness of both. What lies behind is not known to be on the level of the robot: it is a
 drop, or a ramp at least as steep as the line of sight over the edge. It is a drop if neighbouring
-sectors have the edge, and lines of sight over it are steeper than a ramp.
+sectors have the edge, and a line of sight straight over it would be steeper than a ramp. A sensor
+that looks down less sees the edge on both sides: it is straight between them.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,14 +34,12 @@ far apart to tell a drop from a descent."""
 LEAST_SHARE = 0.3
 """Least slope between the two returns of a step, as a share of the slope of the line of sight.
 With a smaller one, the rings are farther apart than the part that the edge hides."""
-MARGIN = 1.02
-"""Largest ratio of the ranges of two returns that may be of one place."""
+MARGIN = 1.02  # largest ratio of the ranges of two returns that may be of one place
 
 WEAK = 0.7
 """A step of this share of the largest allowed one counts, if neighbouring steps are larger: how
 deep a hole is seen depends on which ring just passes its edge."""
-N_ROUGHNESS = 2.5
-"""This many times the roughness of the ground is taken off the height of a step."""
+N_ROUGHNESS = 2.5  # times the roughness of the ground is taken off the height of a step
 BEFORE, BEHIND, WIDTH = 0.4, 1.5, 3
 """Window of the ground before a step, as a share of its range; factor from the beginning of a
 window behind it to the end; sectors on each side that the windows take in."""
@@ -61,18 +60,13 @@ MIN_STEPS, MIN_WIDTH, MIN_STRONG = 3, 1.0, 0.25
 """Least number of steps of an edge, least width [m], and least share of steps that are larger than
 the largest allowed one."""
 STEEPEST, SHALLOWER = 0.21, 0.83
-"""A line of sight over an edge tells a drop from a ramp if it is steeper than this slope, of the
-steepest ramp that robots drive, or than this share of the lowest one of the sensor."""
-LEAST_FALL, LEAST_HIDDEN = 0.02, 0.3
-"""Least fall that hides ground, and least length of what is hidden [m]."""
-FOOT = 0.01
-"""Range of the ground that the robot stands on [m]."""
-MAX_SLOPE = 0.3
-"""Steepest slope that is seen to lead down from the robot; a steeper one is no way."""
-ON_LEVEL = 0.1
-"""What is nearer to the level of the robot before a fall is ground, whatever its label [m]."""
-BIN, N_BINS = 0.1, 500
-"""Width and number of the bins of range in which ground is hidden [m]."""
+"""Slope of the steepest ramp that robots drive: a fall is none if it is steeper along the shortest
+way over its edge; where that is never seen, than this share of the lowest line of sight."""
+LEAST_FALL, LEAST_HIDDEN = 0.02, 0.3  # that hides ground, and least length of what is hidden [m]
+FOOT = 0.01  # range of the ground that the robot stands on [m]
+MAX_SLOPE = 0.3  # steepest slope that is seen to lead down from the robot
+ON_LEVEL = 0.1  # what is nearer to the level before a fall is ground, whatever its label [m]
+BIN, N_BINS = 0.1, 500  # width [m] and number of the bins of range in which ground is hidden
 SAMPLES, SPACING = 8, 0.04
 """Points along an edge in a sector, and their distance along the line between two of them [m]: at
 `REACH` both are closer than the smallest cells of a map."""
@@ -100,8 +94,7 @@ class Edges(NamedTuple):
     def hides(self, x: FloatArray, y: FloatArray) -> BoolArray:
         """Whether places are behind falls."""
         bins = np.minimum(np.hypot(x, y) / BIN, N_BINS - 1).astype(np.int64)
-        result: BoolArray = self.hidden[segment_of(x, y, SECTORS), bins]
-        return result
+        return np.asarray(self.hidden[segment_of(x, y, SECTORS), bins])
 
     def points(self) -> FloatArray:
         """Points along the edges, closer to each other than cells of a map are, (n, 3) [m]."""
@@ -133,28 +126,27 @@ class _Returns(NamedTuple):
     """Returns below the sensor, by sector, and in it from the lowest elevation up."""
 
     point: IntArray  # (n,) in the input; beyond it for the ground that the robot stands on
-    key: IntArray  # (n,) ``sector * N_LEVELS`` + step of elevation
     sector: IntArray  # (n,)
     r: FloatArray  # (n,) horizontal range [m]
     is_ground: BoolArray  # (n,)
-    n_standing: IntArray  # (n + 1,) how many before each stand on the ground
+    stands: BoolArray  # (n,) what stands on the ground, off the level of the robot
     z: FloatArray  # (n,) height [m]
     sight: FloatArray  # (n,) downward slope of the line of sight
 
 
 class _Steps(NamedTuple):
-    """Steps down between two returns that follow each other."""
+    """Steps down from a return to the next one."""
 
     upper: IntArray  # (S,) last return before the step
-    lower: IntArray  # (S,) first return behind it
+    sector: IntArray  # (S,)
+    near: FloatArray  # (S,) range of the last return before it [m]
     fall: FloatArray  # (S,) height that the ground falls, less its roughness [m]
-    is_steep: BoolArray  # (S,) whether the line of sight is steeper than a ramp
+    slope: FloatArray  # (S,) downward slope of the line of sight over it
     is_on_slope: BoolArray  # (S,) whether the ground goes down before or behind it
 
     def where(self, kept: IntArray | BoolArray) -> _Steps:
         """Those of an index or a mask."""
-        taken: list[Any] = [values[kept] for values in self]
-        return _Steps(*taken)
+        return _Steps._make(values[kept] for values in self)
 
 
 def find_edges(
@@ -183,26 +175,35 @@ def find_edges(
     edges = Edges.none(len(xyz))
     returns = _sort(xyz, is_ground, stands, height)
     steps = _steps(returns, *_falls(returns), max_step_down)
-    _hide(edges, returns, steps.where(~steps.is_on_slope), max_step_down)
-    steps = steps.where((steps.fall > WEAK * max_step_down) & (returns.r[steps.upper] > FOOT))
-    order = np.lexsort((returns.r[steps.upper], returns.sector[steps.upper]))
-    _, nearest = np.unique(returns.sector[steps.upper[order]], return_index=True)
-    steps = steps.where(order[nearest])
-    sector, near = returns.sector[steps.upper], returns.r[steps.upper]
+    every, hiding = np.arange(SECTORS), steps.where(~steps.is_on_slope)
+    _hide(edges, returns, hiding, max_step_down)
+    # Where the first return is behind a fall, and its line of sight less steep than a ramp.
+    blind = hiding.sector[(hiding.near == FOOT) & (hiding.slope < STEEPEST)]
+    is_blind = np.isin(every, blind)
+    is_seen = ~is_blind[steps.sector] & (steps.near > FOOT)
+    steps = steps.where((steps.fall > WEAK * max_step_down) & is_seen)
+    sector, lowest = np.unique(steps.sector, return_index=True)
+    if not len(sector):
+        return edges
+    steps = steps.where(lowest)
     # Where the line of sight over the edge meets the upper ground, if that went on.
-    far = np.maximum(near, -returns.z[steps.upper] / returns.sight[steps.lower])
-    gap, group = _group(sector, near, far)
-    for number in np.unique(group):
-        members = np.flatnonzero(group == number)
-        if not _is_edge(steps.where(members), near[members], max_step_down):
-            continue
-        for a in members:
-            # Up to the next step of the edge, as near as the nearer of the two.
-            between = (sector[a] + np.arange(max(gap[a], 1))) % SECTORS
-            edges.r[between] = min(near[a], near[(a + 1) % len(near)])
-            edges.r[sector[a]] = near[a]
-            edges.z[between] = returns.z[steps.upper[a]]
-            edges.goes_on[between] = gap[a] > 0
+    far = np.maximum(steps.near, -returns.z[steps.upper] / steps.slope)
+    gap, group = _group(steps, far, is_blind)
+    # In each sector from a step up to the next of its edge: as near as the nearer of the two, or,
+    # if it is blind, on the line between them.
+    step = np.searchsorted(sector, every, side='right') - 1
+    apart = np.maximum(gap[step], 1)
+    on = np.minimum((every - sector[step]) % SECTORS, apart)
+    before, behind = steps.near[step], np.roll(steps.near, -1)[step]
+    whole, left, right = np.sin(2.0 * math.pi / SECTORS * np.stack([apart, apart - on, on]))
+    straight = whole / (left / before + right / behind)
+    r = np.where(is_blind, straight, np.where(on > 0, np.minimum(before, behind), before))
+    for number in np.flatnonzero(np.bincount(group) >= MIN_STEPS):
+        kept, members = (group[step] == number) & (on < apart), group == number
+        ramp = _steepest_ramp(returns, np.where(kept, r, np.inf), height)
+        if _is_edge(steps.where(members), r[kept & is_blind], ramp, max_step_down):
+            edges.r[kept], edges.z[kept] = r[kept], returns.z[steps.upper[step[kept]]]
+            edges.goes_on[kept] = gap[step[kept]] > 0
     return edges
 
 
@@ -239,9 +240,9 @@ def _hide(edges: Edges, returns: _Returns, steps: _Steps, max_step_down: float) 
     """Enter what lies behind `steps`, which no slope explains, until the level is seen again."""
     z, r = returns.z, returns.r
     starts = np.searchsorted(returns.sector, np.arange(SECTORS + 1))
-    for upper, lower in zip(steps.upper, steps.lower, strict=True):
-        sector, depth = returns.sector[upper], z[upper] - z[lower]
-        if depth < LEAST_HIDDEN * returns.sight[lower]:
+    for upper, sector in zip(steps.upper, steps.sector, strict=True):
+        lower, depth = upper + 1, z[upper] - z[upper + 1]
+        if depth < min(LEAST_HIDDEN * returns.sight[lower], WEAK * max_step_down):
             continue
         start, behind = starts[sector], slice(lower, starts[sector + 1])
         is_level = abs(z[start : upper + 1] - z[start]) < ON_LEVEL
@@ -270,8 +271,7 @@ def _sort(xyz: FloatArray, is_ground: BoolArray, stands: BoolArray, height: floa
     # A surface that goes down behind an edge has the last of the ground before it above it.
     is_level = abs(z + height) < ON_LEVEL
     ground, stood = (np.pad(mask, (0, SECTORS))[kept] for mask in (is_ground, stands))
-    n_standing = np.concatenate([[0], np.cumsum(stood & ~is_level)])
-    return _Returns(kept, key[order], sector[order], r, ground | is_level, n_standing, z, -z / r)
+    return _Returns(kept, sector[order], r, ground | is_level, stood & ~is_level, z, -z / r)
 
 
 def _falls(returns: _Returns) -> tuple[IntArray, FloatArray]:
@@ -281,8 +281,7 @@ def _falls(returns: _Returns) -> tuple[IntArray, FloatArray]:
     sight.
     """
     sector, z, r = returns.sector, returns.z, returns.r
-    stands = np.diff(returns.n_standing) > 0
-    is_fall = (sector[1:] == sector[:-1]) & returns.is_ground[:-1] & ~stands[1:]
+    is_fall = (sector[1:] == sector[:-1]) & returns.is_ground[:-1] & ~returns.stands[1:]
     is_fall &= (z[:-1] - z[1:] > LEAST_FALL) & (r[1:] > r[:-1]) & (r[:-1] < REACH)
     upper = np.flatnonzero(is_fall)
     slope = (z[upper] - z[upper + 1]) / (r[upper + 1] - r[upper])
@@ -324,11 +323,7 @@ def _steps(returns: _Returns, upper: IntArray, slope: FloatArray, max_step_down:
 
     fall = np.minimum(z[upper], level) - z[lower] - N_ROUGHNESS * roughness
     fall = np.where(is_first, z[upper] - z[lower], fall)
-    lowest = np.zeros(SECTORS)
-    np.maximum.at(lowest, sector[r > FOOT], returns.sight[r > FOOT])
-    lowest = np.max([np.roll(lowest, aside) for aside in range(-WIDTH, WIDTH + 1)], axis=0)
-    is_steep = returns.sight[lower] > np.minimum(STEEPEST, SHALLOWER * lowest[sector[upper]])
-    steps = _Steps(upper, lower, fall, is_steep, is_on_slope)
+    steps = _Steps(upper, sector[upper], r[upper], fall, returns.sight[lower], is_on_slope)
     return steps.where(fall > np.where(is_first, max_step_down, LEAST_FALL))
 
 
@@ -342,14 +337,13 @@ def _is_mirrored(returns: _Returns, upper: IntArray) -> BoolArray:
     place = start + r
     farthest = np.where(place == np.maximum.accumulate(place), np.arange(len(r)), 0)
     before = np.maximum.accumulate(farthest)[upper]
-    on_road = returns.is_ground | (np.diff(returns.n_standing) > 0)
-    seen = np.sort(place[on_road])
+    seen = np.sort(place[returns.is_ground | returns.stands])
     is_level = z[before] > z[upper] - ON_LEVEL
     begin = MARGIN * r[np.where(is_level, before, upper)] + 0.05
     end = r[upper + 1] / MARGIN - 0.15
     first, stop = (np.searchsorted(seen, start[upper] + place) for place in (begin, end))
-    result: BoolArray = stop > first
-    return result | ((r[before] > begin) & (z[before] < z[upper + 1] - ON_LEVEL))
+    is_deeper = (r[before] > begin) & (z[before] < z[upper + 1] - ON_LEVEL)
+    return np.asarray((stop > first) | is_deeper)
 
 
 class _Ground(NamedTuple):
@@ -388,28 +382,51 @@ class _Ground(NamedTuple):
         return r, z, slope, std
 
 
-def _group(sector: IntArray, near: FloatArray, far: FloatArray) -> tuple[IntArray, IntArray]:
+def _group(steps: _Steps, far: FloatArray, is_blind: BoolArray) -> tuple[IntArray, IntArray]:
     """Sectors from each step to the next of its edge, or 0 at its end; number of its edge.
 
-    Steps are by sector. The edge is between `near` and `far` [m]: those of an edge overlap, but
-    for what it recedes from sector to sector.
+    Steps are by sector. The edge is between them and `far` [m]: those of an edge overlap, but
+    for what it recedes from sector to sector. Sectors whose first return `is_blind`, behind a
+    fall, do not count: an edge on both sides of them goes on through them.
     """
+    sector, near = steps.sector, steps.near
     gap = (np.roll(sector, -1) - sector) % SECTORS
-    outer = np.minimum(far, np.roll(far, -1)) * (1.0 + SAME_EDGE * gap)
-    joined = (gap <= MAX_APART) & (gap > 0) & (np.maximum(near, np.roll(near, -1)) <= outer)
+    n_seen = np.cumsum(np.tile(~is_blind, 2))
+    apart: IntArray = n_seen[sector + gap] - n_seen[sector]
+    outer = np.minimum(far, np.roll(far, -1)) * (1.0 + SAME_EDGE * apart)
+    is_near = (apart <= MAX_APART) & (gap > 0) & (2 * gap < SECTORS)
+    joined: BoolArray = is_near & (np.maximum(near, np.roll(near, -1)) <= outer)
     ends = np.flatnonzero(~joined)
     # Numbers go up behind each end; what follows the last one belongs to the first edge.
-    group = np.cumsum(np.roll(~joined, 1))
+    group: IntArray = np.cumsum(np.roll(~joined, 1))
     group = (group - group[:1]) % max(len(ends), 1)
     return np.where(joined, gap, 0), group
 
 
-def _is_edge(steps: _Steps, near: FloatArray, max_step_down: float) -> bool:
-    """Whether neighbouring steps are an edge that is wide enough, and no descent."""
-    n, is_strong = len(near), steps.fall > max_step_down
-    n_certain = np.count_nonzero(is_strong & steps.is_steep & ~steps.is_on_slope)
+def _steepest_ramp(returns: _Returns, r: FloatArray, height: float) -> float:
+    """Slope of the steepest ramp that an edge at ranges `r`, (SECTORS,), is told from [m]."""
+    # A sensor that looks down less tells it when it is nearer, at this angle to both sides, if the
+    # level is as wide as that.
+    lowest = float(returns.sight[returns.r > FOOT].max())
+    turn = round(SECTORS / (2.0 * math.pi) * math.acos(min(lowest / STEEPEST, 1.0)))
+    is_level = returns.is_ground & (abs(returns.z + height) < ON_LEVEL) & (returns.r > FOOT)
+    off = returns.sector[is_level] - r.argmin() + WIDTH
+    is_wide = all(((off + aside) % SECTORS <= 2 * WIDTH).any() for aside in (turn, -turn))
+    is_told = is_wide or r.min() < height / STEEPEST
+    return STEEPEST if is_told else min(STEEPEST, SHALLOWER * lowest)
+
+
+def _is_edge(steps: _Steps, unseen: FloatArray, ramp: float, max_step_down: float) -> bool:
+    """Whether neighbouring steps are an edge that is wide enough, and no descent.
+
+    `unseen` are its ranges in blind sectors [m], and `ramp` is the slope of the steepest ramp.
+    """
+    near, is_strong = steps.near, steps.fall > max_step_down
+    # The same fall on the shortest way over the edge.
+    is_steep = steps.slope * near > ramp * np.minimum(near, unseen.min(initial=np.inf))
+    n_certain = np.count_nonzero(is_strong & is_steep & ~steps.is_on_slope)
     return bool(
-        2.0 * math.pi / SECTORS * near.sum() >= MIN_WIDTH
+        2.0 * math.pi / SECTORS * (near.sum() + unseen.sum()) >= MIN_WIDTH
         and n_certain >= MIN_STEPS
-        and np.count_nonzero(is_strong) >= MIN_STRONG * n
+        and np.count_nonzero(is_strong) >= MIN_STRONG * len(near)
     )

@@ -147,17 +147,13 @@ def unused_files(words: Sequence[str], node_name: str) -> list[str]:
         keys: list[str] = []
         with contextlib.suppress(ConfigError):  # it was read before, and may be gone
             keys = [key for key, _ in sections_of(read_yaml(path))]
-        if keys and not any(_is_of_node(key, node_name) for key in keys):
+        # Of what rclpy reads for a node, ``*`` is any word, ``**`` several; rcl has accepted the
+        # rest of the keys: letters, digits, _ and / only.
+        rooted = [f'/{key.removeprefix("/")}'.replace('/*', r'(/\w+)') for key in keys]
+        if keys and not any(re.fullmatch(key, node_name) for key in rooted):
             lines.append(
                 f'{shown(path)}: not used: its parameters are those of '
                 f'{", ".join(keys)}, and this node is {node_name}; '
                 'a key of /** is for every node'
             )
     return lines
-
-
-def _is_of_node(key: str, node_name: str) -> bool:
-    """Whether rclpy gives the parameters of `key` to a node: ``*`` is any word, ``**`` several."""
-    rooted = f'/{key.removeprefix("/")}'
-    # rcl has accepted the key: apart from * it has letters, digits, _ and / only.
-    return re.fullmatch(rooted.replace('/*', r'(/\w+)'), node_name) is not None

@@ -272,11 +272,6 @@ class Diagnostics:
             self._timer.timer_period_ns = round(1e9 * period)
             self._timer.reset()
 
-    def arrived(self, cloud: PointCloud2, arrival: float, n_lost: int) -> None:
-        """Count a cloud that came at the time `arrival` [s], and `n_lost` before it."""
-        self.input.arrived(arrival, cloud)
-        self.processing.n_dropped += n_lost
-
     def published(
         self, scan: Segmentation, arrival: float, stages: Mapping[str, float], age: float | None
     ) -> None:

@@ -48,23 +48,6 @@ def check_overrides(given: Mapping[str, object]) -> None:
             raise ConfigError(f'{name} = {value}: must be an integer in [1, {MAX_DEPTH}]')
 
 
-OnCloud = Callable[[PointCloud2, float, int], None]
-"""Takes a cloud, the time of ``time.monotonic`` at which it came [s], the number lost before."""
-
-
-def wanted_profile(node: Node, topic: str) -> QoSProfile:
-    """Declare ``qos_overrides`` of a subscription of clouds, and return the QoS that they give."""
-    default = QoSProfile(depth=INPUT_DEPTH, reliability=ReliabilityPolicy.BEST_AVAILABLE)
-    # rclpy declares them only where something subscribes.
-    subscription = node.create_subscription(
-        PointCloud2, topic, lambda _cloud: None, default,
-        qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-    )  # fmt: skip
-    profile: QoSProfile = subscription.qos_profile
-    node.destroy_subscription(subscription)
-    return profile
-
-
 class CloudSubscription:
     """Subscription that is best-effort while any publisher is, and reliable otherwise.
 
@@ -72,6 +55,7 @@ class CloudSubscription:
     gets nothing from a best-effort LiDAR driver. ROS decides between them when a subscription with
     `ReliabilityPolicy.BEST_AVAILABLE` is made: `review` makes it, at the start and anew when the
     publishers change. A reliability given in ``qos_overrides`` is kept for any publisher.
+    `callback` takes a cloud, when it came by ``time.monotonic`` [s], and how many it lost before.
     `why_idle` returns why no clouds are wanted: while it returns a text, there is no subscription.
     `on_jump` is called with how far [s] stamps of clouds jump back, as when a bag starts again.
     """
@@ -87,7 +71,7 @@ class CloudSubscription:
         self,
         node: Node,
         topic: str,
-        callback: OnCloud,
+        callback: Callable[[PointCloud2, float, int], None],
         why_idle: Callable[[], str],
         on_jump: Callable[[float], None],
     ) -> None:
@@ -103,7 +87,14 @@ class CloudSubscription:
         self._logged: set[str] = set()  # first words of the faults that were logged
         self._unresolved_topic = topic
         self.topic: str = node.resolve_topic_name(topic)
-        self._profile = wanted_profile(node, topic)
+        # rclpy declares ``qos_overrides`` only where something subscribes.
+        default = QoSProfile(depth=INPUT_DEPTH, reliability=ReliabilityPolicy.BEST_AVAILABLE)
+        options = QoSOverridingOptions.with_default_policies()
+        declared = node.create_subscription(
+            PointCloud2, topic, lambda _cloud: None, default, qos_overriding_options=options
+        )
+        self._profile: QoSProfile = declared.qos_profile
+        node.destroy_subscription(declared)
         self._is_pinned = self._profile.reliability != ReliabilityPolicy.BEST_AVAILABLE
         # The executor still uses a subscription within its own event; a guard condition runs
         # after all that became ready with it.

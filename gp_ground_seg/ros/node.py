@@ -122,7 +122,8 @@ class GroundSegmentationNode(ConfiguredNode):
             return  # it has waited for TF or IMU, and is not wanted any more
         _SPEAKER.set(self)
         start, header = time.monotonic(), cloud.header
-        self._diagnostics.arrived(cloud, arrival, n_lost)
+        self._diagnostics.input.arrived(arrival, cloud)
+        self._diagnostics.processing.n_dropped += n_lost
         try:
             if isinstance(frames, Exception):
                 raise frames

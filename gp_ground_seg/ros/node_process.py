@@ -37,11 +37,12 @@ def run_node(words: Sequence[str], *, is_managed: bool = False) -> int:
 
     `words` are the arguments of the process. Raises a MissingDependencyError without ROS.
     """
-    # Importing ROS takes most of a second; a signal within it is obeyed as well.
+    # Importing ROS takes a second, or several beside others, and leaves nothing to free.
     with stop_on_signals() as stop:
+        stop.ends_process = True
         with needing_ros('the node'):
             from gp_ground_seg.ros.node import main
-        return 0 if stop.made else main(words, is_managed=is_managed)
+        return main(words, is_managed=is_managed)
 
 
 class NodeProcess:

@@ -72,6 +72,8 @@ class ConfiguredNode(Node):  # type: ignore[misc]
     if a parameter file or ``-p`` gives a value that is not accepted.
     """
 
+    config: Config  # parameters in use
+
     def __init__(self, name: str, **options: Any) -> None:
         with start_errors():
             super().__init__(name, start_parameter_services=False, **options)
@@ -83,11 +85,11 @@ class ConfiguredNode(Node):  # type: ignore[misc]
             if value is None and not any(known.startswith(f'{name}.') for known in _NAMES):
                 raise ConfigError(f'{name} = []: {EMPTY_LIST}')
         check_overrides(values)
-        self._config = changed(Config(), self._given.values())
-        self.check_config(self._config)
+        self.config = changed(Config(), self._given.values())
+        self.check_config(self.config)
         with start_errors():
             for spec in parameter_specs():
-                value = self._config[spec.name]
+                value = self.config[spec.name]
                 self.declare_parameter(spec.name, value, descriptor(spec), ignore_override=True)
         self.add_pre_set_parameters_callback(lambda parameters: list(map(_typed, parameters)))
         self.add_on_set_parameters_callback(self._on_set)
@@ -97,11 +99,6 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         ours = {SetParameters: self._on_request, SetParametersAtomically: self._on_atomic_request}
         for service in self.services:
             service.callback = ours.get(service.srv_type, service.callback)
-
-    @property
-    def config(self) -> Config:
-        """Parameters in use."""
-        return self._config
 
     def check_config(self, config: Config) -> None:
         """Raise a GroundSegError if `config` cannot be used here; change nothing."""
@@ -133,10 +130,8 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         """
         messages = request.parameters
         result = self._set_all(messages)
-        if result.successful:
-            response.results = [result] * len(messages)
-        else:
-            response.results = [self._set_all([message]) for message in messages]
+        is_set = result.successful
+        response.results = [result if is_set else self._set_all([one]) for one in messages]
         return response
 
     def _on_atomic_request(self, request: Any, response: Any) -> Any:
@@ -154,16 +149,16 @@ class ConfiguredNode(Node):  # type: ignore[misc]
 
     def _on_set(self, parameters: list[Parameter]) -> Result:
         try:
-            self.check_config(changed(self._config, parameters))
+            self.check_config(changed(self.config, parameters))
         except GroundSegError as error:
             return Result(successful=False, reason=str(error))
         return Result(successful=True)
 
     def _post_set(self, parameters: list[Parameter]) -> None:
-        config = changed(self._config, parameters)
-        if config != self._config:
+        config = changed(self.config, parameters)
+        if config != self.config:
             self.apply_config(config)
-            before, self._config = self._config, config
+            before, self.config = self.config, config
             for spec, old, new in before.differences(config):
                 self.get_logger().info(f'{spec.name}: {old} -> {new}')
 

@@ -48,11 +48,13 @@ def needing_ros(command: str) -> Iterator[None]:
 class StopRequest:
     """Whether a signal to end the process has come."""
 
-    made = False
+    made = ends_process = False
 
     def note(self, _number: int, _frame: FrameType | None) -> None:
         """Set `made`; an exception could interrupt any code, or be swallowed by it."""
         self.made = True
+        if self.ends_process:
+            os._exit(0)
 
 
 @contextmanager

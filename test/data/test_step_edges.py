@@ -55,21 +55,11 @@ def published(xyz, **values):
     return SegmentedCloud(None, GroundSegmenter(config).segment(xyz), config, xyz)
 
 
-def inputs_of(cloud):
-    """Arguments of `find_edges` for a cloud in the level frame of its sensor."""
-    found = cloud.segmentation
-    stands = (found.label == Label.OBSTACLE) & ~(found.labelled.height < 0.0)
-    masks = found.label == Label.GROUND, stands
-    return cloud.points.astype(np.float64), *masks, found.pose.sensor_height
-
-
 def found(cloud, max_step_down=MAX_STEP_DOWN):
-    *inputs, height = inputs_of(cloud)
-    return find_edges(*inputs, max_step_down, height)
-
-
-def edges_of(scene, sensor, max_step_down=MAX_STEP_DOWN):
-    return found(segmented(scene, sensor), max_step_down).r
+    """What `find_edges` finds in a cloud that is in the level frame of its sensor."""
+    result, xyz = cloud.segmentation, cloud.points.astype(np.float64)
+    stands = (result.label == Label.OBSTACLE) & ~(result.labelled.height < 0.0)
+    return find_edges(xyz, result.is_ground, stands, max_step_down, result.pose.sensor_height)
 
 
 TOWARDS, AWAY, ASIDE = 0.0, math.pi, -1.0  # headings, also about the seam of the sectors
@@ -112,7 +102,7 @@ DROPS = [
 def test_drops_are_marked_at_the_last_ring_before_them(terrain, at, heading, name, max_step_down):
     sensor = MOUNTED[name]
     ahead = np.cos(MIDDLE - heading)
-    r, distance = edges_of(terrain, sensor, max_step_down), at / np.maximum(ahead, 0.05)
+    r, distance = found(segmented(terrain, sensor), max_step_down).r, at / np.maximum(ahead, 0.05)
     # Where ground is seen before the edge, and over it more steeply than along a ramp.
     down = np.sort([-elevation for elevation in sensor.elevations if elevation < -1e-3])[::-1]
     rings = sensor.height / np.tan(down)
@@ -151,7 +141,7 @@ def test_ground_goes_on_up_to_an_edge_and_below_it(name, at, depth, width):
     assert (r[towards] <= distance[towards] + 0.2).mean() >= 0.95
 
 
-LOWER = descent(5.5, 4.0, 0.4)
+LOWER, RAMP = descent(5.5, 4.0, 0.4), descent(2.0, 10.2, 1.4)
 # Largest step that is none, and scenes.
 NO_EDGES = {
     'long ramps': (
@@ -266,12 +256,11 @@ def test_scan_ends_at_the_edge_and_occupancy_has_it():
     cloud = segmented(drop(6.0, 0.6), MOUNTED['hdl-64e'])
     returns = cloud.places(np.isfinite(cloud.points).all(axis=1))
     ranges = costmap.scan_ranges(cloud.blocked, returns)
-    towards = (np.arange(DIRECTIONS) + 0.5) * 2.0 * np.pi / DIRECTIONS - np.pi
-    distance = 6.0 / np.maximum(np.cos(towards), 1e-6)
+    distance = 6.0 / np.maximum(np.cos(MIDDLE_OF_DIRECTIONS), 1e-6)
     near = distance < 9.0
     assert (ranges[near] <= distance[near] + 0.1).mean() > 0.98
     assert (ranges[near] >= 0.9 * distance[near]).mean() > 0.98
-    assert not np.isfinite(ranges[np.cos(towards) < 0.0]).any()
+    assert not np.isfinite(ranges[np.cos(MIDDLE_OF_DIRECTIONS) < 0.0]).any()
     # A line of cells without holes: in every row about the x axis one before 6 m.
     reach, ground = np.full(DIRECTIONS, 100.0, np.float32), cloud.places(cloud.is_ground)
     occupied = costmap.occupancy(ground, cloud.blocked, reach, 0.1, 20.0) == OCCUPIED
@@ -357,6 +346,15 @@ def test_a_hidden_slope_is_neither_marked_nor_free():
         assert np.isnan(ranges[AHEAD]).all()
         assert (cells[:, 15:30] == costmap.FREE).mean() > 0.9
         assert (cells[:, 40:] == costmap.UNKNOWN).all()
+
+
+def test_a_drop_that_is_seen_only_on_both_sides_is_marked_ahead(monkeypatch):
+    """Where a ramp would be seen: the sensor looks down less steeply than that."""
+    monkeypatch.setitem(MOUNTED, 'flat', dataclasses.replace(SENSORS['mid-360'], height=0.5))
+    for ground, expected in ((drop(2.0, 1.2), 2.1), (drop(2.0, 0.25), 2.1), (RAMP, math.nan)):
+        ranges, cells = ranges_and_cells(ground, 'flat')
+        np.testing.assert_allclose(ranges[AHEAD], expected, rtol=0.15)
+        assert not (cells[:, 25:60] == costmap.FREE).any()
 
 
 def test_own_level_behind_a_ditch_is_free():
