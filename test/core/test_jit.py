@@ -1,6 +1,7 @@
 """Compiled code on disk: used again, never when damaged, planted or out of date."""
 
 import fcntl
+import hashlib
 import json
 import os
 import signal
@@ -105,8 +106,8 @@ class Program:
         assert codes == n * [code], self.stderr
         return [json.loads(text) for text in said if code == 0]
 
-    def code(self, name: str = 'double', kind: str = 'nbc') -> Path:
-        (found,) = self.cache.rglob(f'small.{name}-*.{kind}')
+    def code(self) -> Path:
+        (found,) = self.cache.rglob('small.double.code')
         return found
 
 
@@ -133,7 +134,7 @@ def test_code_is_compiled_once_said_once_and_then_loaded(program):
     # Beside the sources it would survive pip's uninstall, as a package without a version.
     assert Path(folder) in program.code().parents
     assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
-    assert not list(program.folder.glob('__pycache__/*.nb[ic]'))
+    assert not list(program.folder.rglob('*.nb[ic]'))
 
 
 def test_code_lies_in_the_cache_of_the_user_by_default_and_never_in_the_current_folder(
@@ -169,7 +170,7 @@ DAMAGES = {
 )
 def test_damaged_code_is_compiled_again_and_that_of_other_functions_loaded(program, name):
     program.run()
-    DAMAGES.get(name, plant)(program.code(kind='nbc' if name in DAMAGES else 'nbi'))
+    DAMAGES.get(name, plant)(program.code())
     assert program.run()[:4] == [42.0, 1, 1, False]
     # Without the list of files nobody knows that they are all there, until they are loaded.
     next(program.cache.rglob('all')).unlink()
@@ -204,9 +205,9 @@ def test_one_process_compiles_and_others_wait_for_its_files(program):
 
 def test_code_is_not_read_from_where_others_can_put_it(program):
     *_, folder = program.run()
-    plant(index := program.code(kind='nbi'))
-    checksum = index.with_name('small.double.sha256')
-    checksum.write_bytes(jit_module._digest_of(jit_module._files_of(checksum)))
+    plant(program.code())
+    planted = program.code().read_bytes()
+    program.code().write_bytes(hashlib.sha256(planted).digest() + planted)
     Path(folder).chmod(0o701)
     assert program.run() == NOT_KEPT
     assert 'others can open' in program.stderr
