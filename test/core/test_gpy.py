@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_likelihood import COMPILED
 
 from gp_ground_seg import Config
-from gp_ground_seg.core.compiled import likelihood as compiled
 from gp_ground_seg.core.frame import Candidates, Frame, Inliers, Lines, PseudoInputs
 from gp_ground_seg.core.gp.likelihood import log_likelihood
 from gp_ground_seg.core.parameters.schema import numbers_of
@@ -58,15 +58,12 @@ def test_the_surface_is_that_of_gpy(backend):
     np.testing.assert_allclose(np.concatenate(found), expected, rtol=0.0, atol=tolerance)
 
 
-@pytest.mark.parametrize('by', ['numpy', 'numba'])
-def test_the_likelihood_and_its_gradient_are_those_of_gpy(by):
+@pytest.mark.parametrize('find', [log_likelihood, COMPILED])
+def test_the_likelihood_and_its_gradient_are_those_of_gpy(find):
     inliers = Inliers(
         offsets('r'), column('r'), column('z'), np.zeros(len(column('r'))),
         offsets('r_bar'), column('r_bar'), column('log_extent'), column('kind'),
     )  # fmt: skip
-    arguments = THETA, inliers, numbers_of(CONFIG.observation), False
-    value, gradient = log_likelihood(*arguments)
-    if by == 'numba':
-        value = compiled.log_likelihood(*arguments, gradient)
+    value, gradient = find(THETA, inliers, numbers_of(CONFIG.observation), False)
     assert value == pytest.approx(TABLE['log_likelihood'], rel=1e-9)
     np.testing.assert_allclose(gradient, TABLE['gradient'], rtol=1e-6)

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from gp_ground_seg.core.compiled import numerics
 from gp_ground_seg.core.compiled.numerics import exp_neg
+from gp_ground_seg.core.gp import kernels
 from gp_ground_seg.core.jit import JIT_ENABLED
 
 
@@ -19,9 +20,7 @@ def compiled(function):
     return numba.njit(function)
 
 
-factorise, invert, solve_in_place = map(
-    compiled, (numerics.factorise, numerics.invert, numerics.solve_in_place)
-)
+inverted, solve_in_place = map(compiled, (numerics.inverted, numerics.solve_in_place))
 
 
 @given(st.floats(0.0, 1e300), st.floats(-10.0, 0.0))
@@ -57,12 +56,12 @@ def test_small_systems(seed, n):
     expected = np.linalg.solve(a, vector[:n])
     assert solve_in_place(matrix, n, vector)
     np.testing.assert_allclose(vector[:n], expected, rtol=1e-8, atol=1e-8)
-    factor, inverse = a.copy(), np.empty((n, n))
-    assert factorise(factor, n)
+    factor = a.copy()
+    inverse, log_root = inverted(factor)
     np.testing.assert_allclose(np.triu(factor).T, np.linalg.cholesky(a), rtol=1e-9, atol=1e-9)
-    invert(factor, n, np.empty((n, n)), inverse)
     np.testing.assert_allclose(inverse, np.linalg.inv(a), rtol=1e-7, atol=1e-7)
     np.testing.assert_array_equal(inverse, inverse.T)
+    assert [log_root, kernels.inverted(a)[1]] == pytest.approx(2 * [np.linalg.slogdet(a)[1] / 2])
 
 
 @pytest.mark.parametrize('worst', [0.0, -1.0, np.nan])
@@ -70,4 +69,5 @@ def test_no_positive_definite_matrix_no_solution(worst):
     matrix = np.zeros((4, numerics.LANES))
     np.fill_diagonal(matrix, [1.0, 2.0, worst, 1.0])
     assert not solve_in_place(matrix.copy(), 4, np.ones(4))
-    assert not factorise(matrix, 4)
+    for find in (inverted, kernels.inverted):
+        assert np.isnan(find(matrix[:, :4].copy())[1])
