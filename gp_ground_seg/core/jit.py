@@ -1,9 +1,9 @@
 """The one policy for code compiled with numba, which is optional, and for keeping it on disk.
 
-numba keeps compiled code itself (``cache=True``), here in a folder of the user that is named by
-our sources and by versions: code of other sources is never read. Each function has a checksum of
-its files: what is damaged, as after a power cut, is compiled again. Of several processes one
-compiles a function, and the others wait for its files.
+numba says what is to be kept (``cache=True``), and we where: in a folder of the user that is named
+by our sources and by versions, so that code of other sources is never read. Each function has a
+file that begins with its checksum: what is damaged, as after a power cut, is compiled again. Of
+several processes one compiles a function, and the others wait for its file.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import functools
-import glob
 import hashlib
 import importlib.util
 import logging
 import os
+import pickle
 import stat
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -38,9 +38,8 @@ _Function = TypeVar('_Function', bound=Callable[..., Any])
 _CORE = Path(__file__).parent
 _entry_points: list[Any] = []
 _shared: list[Callable[..., Any]] = []
-_ALL, _CHECKSUM, _LOCK = 'all', '.sha256', '.lock'
-_kept: set[str] = set()  # checksums of the functions that this process has read or written
-_turn: IO[bytes] | None = None  # the file that is locked while a function is compiled
+_ALL, _CHECKSUM_SIZE = 'all', hashlib.sha256().digest_size
+_kept: set[str] = set()  # files of the functions that this process has read or written
 _patience = 120.0  # longest wait for others, in all [s]: one may be suspended
 
 
@@ -152,99 +151,90 @@ def _njit_kept(function: Callable[..., Any]) -> Any:
         kept = numba.njit(**_options(), cache=True)(function)
     finally:
         numba.config.CACHE_DIR = before
-    place = Path(kept.stats.cache_path)
-    if folder not in place.parents:
+    if folder not in Path(kept.stats.cache_path).parents:
         _log_not_kept(f'{folder} cannot be written to')
         return numba.njit(**_options())(function)
-    # numba has no public hook here; a numba without these names keeps code without checksums.
+    # numba has no public hook here; one without these names keeps code in files of its own.
     cache: Any = getattr(kept, '_cache', None)
-    module = Path(function.__code__.co_filename).stem
-    if hasattr(cache, 'load_overload') and hasattr(cache, 'save_overload'):
-        checksum = place / f'{module}.{function.__qualname__}{_CHECKSUM}'
-        cache.load_overload = functools.partial(_load, cache.load_overload, folder, checksum)
-        cache.save_overload = functools.partial(_save, cache.save_overload, folder, checksum)
+    if hasattr(cache, '_cache_file'):
+        name = f'{function.__module__}.{function.__qualname__}.code'
+        cache._cache_file = _CodeFile(folder / name)
     return kept
 
 
-def _load(load: Callable[..., Any], folder: Path, checksum: Path, *arguments: Any) -> Any:
-    """Let numba `load` code if its files are whole; None where it has to compile."""
-    with contextlib.suppress(OSError):
-        if not _is_whole(checksum):
-            _begin_turn(checksum)
-            if not _is_whole(checksum):
-                for path in _files_of(checksum):
-                    path.unlink(missing_ok=True)
-        if (found := load(*arguments)) is not None:
-            _list(folder, checksum)
-            _end_turn()  # another process has compiled it meanwhile
-            return found
-    _begin_turn(checksum)
-    log_once(logging.WARNING, 'compiling once for this processor, which takes 20 to 60 s')
-    return None
+class _CodeFile:
+    """Code of one function, for each type of its arguments, in place of the files of numba."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock: IO[bytes] | None = None  # held while the function is compiled
+
+    def load(self, key: object) -> Any:
+        """Return code, or None where it has to be compiled; then `save` follows."""
+        if (code := self._read().get(key)) is None:
+            self._begin_turn()
+            if (code := self._read().get(key)) is None:
+                log_once(
+                    logging.WARNING, 'compiling once for this processor, which takes 20 to 60 s'
+                )
+                return None
+            self._end_turn()  # another process has compiled it meanwhile
+        _list(self._path)
+        return code
+
+    def save(self, key: object, code: object) -> None:
+        """Write what was compiled; a full disk is a warning."""
+        from numba.core.serialize import dumps
+
+        try:
+            content = dumps({**self._read(), key: code})
+            self._path.write_bytes(hashlib.sha256(content).digest() + content)
+            _list(self._path)
+        except OSError as error:
+            _log_not_kept(error)
+        finally:
+            self._end_turn()
+
+    def _read(self) -> dict[object, Any]:
+        content = _read_whole(self._path)
+        return pickle.loads(content) if content else {}
+
+    def _begin_turn(self) -> None:
+        """Wait until no other process compiles the function, or the patience is at an end."""
+        global _patience
+        with contextlib.suppress(OSError):  # the disk is full, or has no locks
+            self._lock = self._lock or self._path.with_suffix('.lock').open('ab')
+            while _patience > 0.0:
+                try:
+                    return fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    time.sleep(0.05)
+                    _patience -= 0.05
+
+    def _end_turn(self) -> None:
+        if self._lock is not None:
+            with contextlib.suppress(OSError):
+                fcntl.flock(self._lock, fcntl.LOCK_UN)  # a forked process may have it open
+            self._lock.close()
+            self._lock = None
 
 
-def _save(save: Callable[..., Any], folder: Path, checksum: Path, *arguments: Any) -> None:
-    """Let numba `save` what it has compiled; a full disk is a warning."""
+def _read_whole(path: Path) -> bytes:
+    """Return what was written to a file behind its checksum; nothing if they do not agree."""
     try:
-        save(*arguments)
-        checksum.write_bytes(_digest_of(_files_of(checksum)))
-        _list(folder, checksum)
-    except OSError as error:
-        _log_not_kept(error)
-    finally:
-        _end_turn()
-
-
-def _files_of(checksum: Path) -> list[Path]:
-    """Return the files in which numba keeps the code of a function."""
-    name = glob.escape(checksum.name.removesuffix(_CHECKSUM))
-    return [*checksum.parent.glob(f'{name}-*.nb[ic]')]
-
-
-def _digest_of(files: Iterable[Path], begin: str = '') -> bytes:
-    digest = hashlib.sha256(begin.encode())
-    for path in sorted(files):
-        digest.update(path.name.encode() + b'\0' + path.read_bytes())
-    return digest.digest()
-
-
-def _is_whole(checksum: Path) -> bool:
-    """Whether the files of a function are those that were written."""
-    try:
-        return checksum.read_bytes() == _digest_of(_files_of(checksum))
+        found = path.read_bytes()
     except OSError:
-        return False
+        return b''
+    checksum, content = found[:_CHECKSUM_SIZE], found[_CHECKSUM_SIZE:]
+    return content if hashlib.sha256(content).digest() == checksum else b''
 
 
-def _list(folder: Path, checksum: Path) -> None:
-    """Write the list of checksums that a frame needs, once each function has one."""
-    _kept.add(str(checksum.relative_to(folder)))
+def _list(path: Path) -> None:
+    """Write the list of files that a frame needs, once each function has one."""
+    _kept.add(path.name)
     if len(_kept) == len(_entry_points) and not is_code_kept():
         with contextlib.suppress(OSError):
-            (folder / _ALL).write_text('\n'.join(sorted(_kept)))
-
-
-def _begin_turn(checksum: Path) -> None:
-    """Wait until no other process compiles this function, or the patience is at an end."""
-    global _turn, _patience
-    with contextlib.suppress(OSError):  # the disk is full, or has no locks
-        _turn = _turn or checksum.with_suffix(_LOCK).open('ab')
-        while _patience > 0.0:
-            try:
-                return fcntl.flock(_turn, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                time.sleep(0.05)
-                _patience -= 0.05
-
-
-def _end_turn() -> None:
-    """Let another process compile the function."""
-    global _turn
-    if _turn is not None:
-        with contextlib.suppress(OSError):
-            fcntl.flock(_turn, fcntl.LOCK_UN)  # a forked process may have it open
-        _turn.close()
-        _turn = None
+            (path.parent / _ALL).write_text('\n'.join(sorted(_kept)))
 
 
 def _log_not_kept(reason: object) -> None:
@@ -294,7 +284,10 @@ def _require_private(folder: Path) -> None:
 def _digest() -> str:
     """Name of what the code was compiled from: sources, where they lie, and versions."""
     versions = [sys.version, np.__version__, *map(metadata.version, ('numba', 'llvmlite'))]
-    return _digest_of(_CORE.rglob('*.py'), '\n'.join([str(_CORE), *versions])).hex()[:16]
+    digest = hashlib.sha256('\n'.join([str(_CORE), *versions]).encode())
+    for path in sorted(_CORE.rglob('*.py')):
+        digest.update(path.name.encode() + b'\0' + path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def has_to_compile() -> bool:
@@ -311,4 +304,4 @@ def is_code_kept() -> bool:
         names = (folder / _ALL).read_text().splitlines()
     except (OSError, UnicodeError):
         return False
-    return bool(names) and all(_is_whole(folder / name) for name in names)
+    return bool(names) and all(_read_whole(folder / name) for name in names)

@@ -105,8 +105,8 @@ class Program:
         assert codes == n * [code], self.stderr
         return [json.loads(text) for text in said if code == 0]
 
-    def code(self, name: str = 'double', kind: str = 'nbc') -> Path:
-        (found,) = self.cache.rglob(f'small.{name}-*.{kind}')
+    def code(self) -> Path:
+        (found,) = self.cache.rglob('small.double.code')
         return found
 
 
@@ -133,7 +133,7 @@ def test_code_is_compiled_once_said_once_and_then_loaded(program):
     # Beside the sources it would survive pip's uninstall, as a package without a version.
     assert Path(folder) in program.code().parents
     assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
-    assert not list(program.folder.glob('__pycache__/*.nb[ic]'))
+    assert not list(program.folder.rglob('*.nb[ic]'))
     # It is not read from where others can put it.
     Path(folder).chmod(0o701)
     assert program.run() == NOT_KEPT and 'others can open' in program.stderr
@@ -172,7 +172,7 @@ DAMAGES = {
 )
 def test_damaged_code_is_compiled_again_and_that_of_other_functions_loaded(program, name):
     program.run()
-    DAMAGES.get(name, plant)(program.code(kind='nbc' if name in DAMAGES else 'nbi'))
+    DAMAGES.get(name, plant)(program.code())
     assert program.run()[:4] == [42.0, 1, 1, False]
     # Without the list of files nobody knows that they are all there, until they are loaded.
     next(program.cache.rglob('all')).unlink()

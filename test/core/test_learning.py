@@ -10,12 +10,11 @@ from conftest import fewer, hilly_scan
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
-from gp_ground_seg.core.frame import Frame, Inliers
+from gp_ground_seg.core.frame import Inliers
 from gp_ground_seg.core.gp import learning
 from gp_ground_seg.core.gp.learning import (
     Learned,
     ThetaSpace,
-    every_segment,
     given_theta,
     theta_space,
 )
@@ -65,12 +64,12 @@ def learn(inliers, space, start, use_priors=True, max_evaluations=200):
     """Outcome, and the values of the objective without priors."""
     values, theta, outcome = [], start.copy(), np.empty(2)
 
-    def set_likelihood(theta, *arguments):
-        value, arguments[-1][:] = log_likelihood(theta, *arguments[:-1])
-        values.append(value)
-        return value
+    def find(*arguments):
+        found = log_likelihood(*arguments)
+        values.append(found[0])
+        return found
 
-    with patch.object(learning, 'set_likelihood', set_likelihood):
+    with patch.object(learning, 'log_likelihood', find):
         n = learning.maximise(space, inliers, LEVEL, use_priors, max_evaluations, theta, outcome)
     assert n == len(values)
     return Learned.of(theta, float(outcome[0]), n, int(outcome[1]), space), values
@@ -175,20 +174,22 @@ def test_what_is_learned_does_not_choose_inliers():
 
 
 def test_every_nth_segment_by_itself_has_the_inliers_it_has_in_the_frame():
-    config = Config().replace(**{'surface.look_aside': False})
-    found = GroundSegmenter(config.replace(**{'learning.mode': 'fixed'})).segment(hilly_scan(900))
-    onward = np.full(len(found.candidates.r), -np.inf)
-    edges, nowhere = found.surface.knots, np.isfinite(onward)
-    frame = Frame(found.candidates, found.lines, found.pseudo, onward, nowhere, edges, -1.73)
-    own = every_segment(frame, 7)
-    kept = np.isin(frame.candidates.segment, np.arange(0, config.grid.n_segments, 7))
-    theta = given_theta(config)
-    whole, _, whole_u = MODEL.estimate_surface(frame, theta, config)
-    alone, _, alone_u = MODEL.estimate_surface(own, theta, config)
-    np.testing.assert_array_equal(own.candidates.r, frame.candidates.r[kept])
-    np.testing.assert_array_equal(alone.inlier, whole.inlier[kept])
-    np.testing.assert_allclose(alone_u, whole_u[kept])
-    assert len(own.knots) == 0
+    """These alone are learned from."""
+    config = Config().replace(**{'surface.look_aside': False, 'learning.segment_step': 7})
+    frame, taken = GroundSegmenter(config, backend=MODEL).segment(hilly_scan(900)).frame, []
+
+    def find(theta, inliers, *others):
+        taken.append(inliers)
+        return log_likelihood(theta, inliers, *others)
+
+    with patch.object(learning, 'log_likelihood', find):
+        learned = NumpyBackend().learn_frame(frame, config)
+    whole, _, whole_u = MODEL.estimate_surface(frame, given_theta(config), config)
+    kept = whole.inlier & (frame.candidates.segment % 7 == 0)
+    np.testing.assert_array_equal(taken[0].r, frame.candidates.r[kept])
+    np.testing.assert_array_equal(taken[0].z, frame.candidates.z[kept] - frame.prior_mean)
+    np.testing.assert_allclose(taken[0].log_length_scale, whole_u[kept], atol=1e-6)
+    np.testing.assert_allclose(MODEL.learn_frame(frame, config).theta, learned.theta, atol=1e-6)
 
 
 def test_the_preset_paper_learns_until_no_more_join():

@@ -8,7 +8,7 @@ import pytest
 import reference_gp
 from test_gpy import CONFIG, TABLE, THETA, column, offsets
 
-from gp_ground_seg.core.compiled import likelihood as compiled
+import gp_ground_seg.core.compiled.likelihood  # noqa: F401 - the compiled form of a part
 from gp_ground_seg.core.frame import Inliers
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.core.gp.likelihood import log_likelihood
@@ -16,6 +16,7 @@ from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import ObservationConfig
 from gp_ground_seg.core.parameters.schema import numbers_of
 
+COMPILED = jit(part=True)(log_likelihood)
 # With a factor for each class of lines.
 FACTORS = np.array([0.8, 0.5, 1.3, 1.0, 0.7, 2.0, 0.9, 1.1, 0.6])
 PRIOR = numbers_of(ObservationConfig(slope_std=0.05, slope_drift=0.01))
@@ -23,15 +24,7 @@ LEVEL = numbers_of(ObservationConfig(slope_std=0.0, slope_drift=0.0))
 TYPICAL = np.log([0.3, 0.05, 0.9, 3.0, 0.25, *FACTORS])
 
 
-set_likelihood = jit(part=True)(compiled.log_likelihood)
-
-
-def compiled_log_likelihood(theta, *arguments):
-    gradient = np.empty(len(theta))
-    return set_likelihood(theta, *arguments, gradient), gradient
-
-
-@pytest.fixture(params=[log_likelihood, compiled_log_likelihood], ids=['numpy', 'numba'])
+@pytest.fixture(params=[log_likelihood, COMPILED], ids=['numpy', 'numba'])
 def likelihood(request):
     return request.param
 

@@ -6,22 +6,13 @@ from functools import partial
 
 import numpy as np
 
-from gp_ground_seg.core.compiled import (
-    evidence,
-    ground,
-    ground_plane,
-    labels,
-    learning,
-    polar_grid,
-)
+from gp_ground_seg.core.compiled import ground_plane, labels, polar_grid
 from gp_ground_seg.core.compiled import relief as relief_
 from gp_ground_seg.core.compiled import vertical_faces as faces_
 from gp_ground_seg.core.frame import (
     OUTSIDE,
     Candidates,
     Faces,
-    FloatArray,
-    Frame,
     GroundSurface,
     Labelled,
     PointArray,
@@ -30,9 +21,8 @@ from gp_ground_seg.core.frame import (
     Tiles,
     linear_pieces,
 )
-from gp_ground_seg.core.gp.evidence import ODDS, uses_neighbours_in
-from gp_ground_seg.core.gp.latent import given_log_length_scales, given_theta
-from gp_ground_seg.core.gp.learning import Learned, theta_space
+from gp_ground_seg.core.gp.ground import estimate_surface, fit_surfaces
+from gp_ground_seg.core.gp.learning import fit_theta, learn_frame
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import numbers_of
@@ -55,6 +45,8 @@ class NumbaBackend:
     name = 'numba'
     fit_plane = staticmethod(ground_plane.fit_plane)
     extract_lines = staticmethod(partial(find_lines, trace_lines=jit(entry=True)(trace)))
+    learn_frame = staticmethod(partial(learn_frame, fit=jit(entry=True)(fit_theta)))
+    estimate_surface = staticmethod(partial(estimate_surface, fit=jit(entry=True)(fit_surfaces)))
 
     def build_grid(self, xyz: PointArray, config: Config) -> Scan:
         """Sort points into cells and tiles; lowest point of each cell."""
@@ -93,61 +85,6 @@ class NumbaBackend:
         relief_.find_relief(candidates, faces, height, growth, relief.pieces, z, stands)
         over = candidates if relief.is_level else candidates._replace(z=z)
         return relief, over, with_standing(faces, candidates.tile, stands)
-
-    def learn_frame(self, frame: Frame, config: Config) -> Learned:
-        """Hyper-parameters of the frame."""
-        no_knots, space = frame._replace(knots=frame.knots[:0]), theta_space(config)
-        theta, outcome = given_theta(config), np.empty(2)
-        n = learning.learn_frame(
-            no_knots,
-            space,
-            numbers_of(config.observation),
-            numbers_of(config.growth),
-            numbers_of(config.learning),
-            config.learning.objective == 'map',
-            config.length_scale.model == 'latent',
-            ODDS if config.label.rule == 'roughness' else 0.0,
-            self._surfaces(no_knots, config),
-            theta,
-            outcome,
-        )
-        return Learned.of(theta, float(outcome[0]), n, int(outcome[1]), space)
-
-    def estimate_surface(
-        self, frame: Frame, theta: FloatArray, config: Config
-    ) -> tuple[GroundSurface, FloatArray, FloatArray]:
-        """Inliers, the surface, and log length-scales at the knots and at the candidates."""
-        found = self._surfaces(frame, config)
-        evidence.estimate_surface(
-            frame,
-            given_theta(config),
-            theta,
-            numbers_of(config.observation),
-            numbers_of(config.growth),
-            config.length_scale.model == 'latent',
-            uses_neighbours_in(frame, config),
-            config.label.rule == 'roughness',
-            found,
-        )
-        surface = GroundSurface(frame.knots, found.mean, found.std, found.inlier)
-        return surface, found.knot_log_length_scale, found.log_length_scale
-
-    def _surfaces(self, frame: Frame, config: Config) -> ground.SegmentSurfaces:
-        """Surfaces to be set, with log length-scales, to be set as well if they are latent."""
-        n, shape = len(frame.candidates.r), (frame.candidates.n_segments, len(frame.knots))
-        if config.length_scale.model == 'latent':
-            u, knot_u = np.empty(n), np.empty(shape)
-        else:
-            u, knot_u = given_log_length_scales(frame, config.length_scale)
-        return ground.SegmentSurfaces(
-            u,
-            knot_u,
-            np.empty(n, np.bool_),
-            np.empty(n, np.bool_),
-            np.empty(n),
-            np.empty(n),
-            *np.full((2, *shape), np.nan),
-        )
 
     def label_points(
         self,

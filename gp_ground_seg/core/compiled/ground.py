@@ -15,7 +15,8 @@ import numpy as np
 
 from gp_ground_seg.core.compiled.numerics import LANES
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, IntArray
-from gp_ground_seg.core.gp.evidence import between_knots, combined, contradicts
+from gp_ground_seg.core.gp import ground
+from gp_ground_seg.core.gp.evidence import Evidence, between_knots, combined, contradicts
 from gp_ground_seg.core.gp.ground import (
     ROUNDING_SINGLE,
     carries_on,
@@ -28,27 +29,11 @@ from gp_ground_seg.core.gp.kernels import (
     line_covariance,
     line_variances,
     paciorek,
-    prior_variance,
 )
-from gp_ground_seg.core.jit import jit
+from gp_ground_seg.core.gp.model import Model, SegmentSurfaces
+from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
 from gp_ground_seg.core.pipeline.lines import is_walkable
-
-
-class SegmentSurfaces(NamedTuple):
-    """The surface of each segment by itself."""
-
-    log_length_scale: FloatArray  # (C,) at the candidates [log m]
-    # (M, K) at the knots [log m]; NaN from the first knot on that is not wanted
-    knot_log_length_scale: FloatArray
-    seed: BoolArray  # (C,) candidates that start the inlier set
-    inlier: BoolArray  # (C,) candidates that the surface rests on
-    alike: FloatArray  # (C,) candidates close to each, itself as well, see `noise_among`
-    doubt: FloatArray  # (C,) variance by which an inlier may be an obstacle [m^2]
-    # (M, K) height about the prior mean and its standard deviation at the knots [m]; NaN where
-    # there is none
-    mean: FloatArray
-    std: FloatArray
 
 
 class _Columns(NamedTuple):
@@ -78,12 +63,8 @@ class _Prior(NamedTuple):
 
 @jit(part=True)
 def _prior_of(frame: Frame, theta: FloatArray, observation: ObservationConfig) -> _Prior:
-    sill, noise = variances_of(theta)
+    sill, noise = variances_of(frame, theta, observation, ROUNDING_SINGLE)
     slope, sixth = line_variances(observation)
-    farthest = 0.0
-    for c in range(len(frame.candidates.r)):
-        farthest = max(farthest, frame.candidates.r[c])
-    noise = max(noise, ROUNDING_SINGLE * prior_variance(sill, observation, farthest))
     return _Prior(sill, slope, sixth, noise)
 
 
@@ -111,60 +92,54 @@ def _make_columns(frame: Frame, step: int, n_knots: int, precision: Any) -> _Col
     )
 
 
-@jit()
+@compiled_form(ground.grow_inliers)
 def grow_inliers(
     frame: Frame,
     theta: FloatArray,
-    observation: ObservationConfig,
-    growth: GrowthConfig,
+    model: Model,
     odds: float,
-    from_neighbours: FloatArray,
+    from_neighbours: Evidence,
     step: int,
-    by_itself: SegmentSurfaces,
+    found: SegmentSurfaces,
 ) -> None:
-    """Inliers of every `step`-th segment, into `by_itself`, which has the seeds.
-
-    `from_neighbours` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is
-    none. Unless `odds` are 0, a candidate among others, or that joins in doubt, shows less: see
-    `noise_among` and `noise_in_doubt`.
-    """
+    """Do what the twin does; the inliers of other segments are arbitrary."""
     columns = _make_columns(frame, step, 0, np.float32)
-    prior = _prior_of(frame, theta, observation)
+    prior = _prior_of(frame, theta, model.observation)
     reach = math.exp(theta[3]) if odds > 0.0 else 0.0
     for m in range(0, len(frame.candidates.offsets) - 1, step):
-        n_new = _begin(frame, m, prior.noise, reach, from_neighbours, by_itself, columns)
-        _grow(frame, m, n_new, prior, growth, odds, by_itself, columns)
+        n_new = _begin(frame, m, prior.noise, reach, from_neighbours, found, columns)
+        _grow(frame, m, n_new, prior, model.growth, odds, found, columns)
         first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
         for c in range(first, stop):
-            certain = noise_among(by_itself.alike[c], prior.noise)
-            by_itself.doubt[c] = columns.noise[c - first] - certain
+            certain = noise_among(found.alike[c], prior.noise)
+            found.doubt[c] = columns.noise[c - first] - certain
 
 
-@jit()
+@compiled_form(ground.regress)
 def regress(
     frame: Frame,
     theta: FloatArray,
     observation: ObservationConfig,
     step: int,
-    by_itself: SegmentSurfaces,
+    found: SegmentSurfaces,
 ) -> None:
-    """Surface of every `step`-th segment by its inliers and `theta`, into `by_itself`."""
+    """Do what the twin does."""
     knots, candidates = frame.knots, frame.candidates
     # What is learned may be a noise of millimetres, which single precision would not resolve.
     columns = _make_columns(frame, step, len(knots), np.float64)
     prior = _prior_of(frame, theta, observation)
     r, length_scale = columns.r, columns.length_scale
-    for m in range(0, len(by_itself.mean), step):
-        mean, std, knot_u = by_itself.mean[m], by_itself.std[m], by_itself.knot_log_length_scale[m]
+    for m in range(0, len(found.mean), step):
+        mean, std, knot_u = found.mean[m], found.std[m], found.knot_log_length_scale[m]
         for j in range(len(knots)):
             mean[j] = std[j] = np.nan
         n = n_knots = 0
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
-            if by_itself.inlier[c]:
-                r[n], length_scale[n] = candidates.r[c], by_itself.log_length_scale[c]
+            if found.inlier[c]:
+                r[n], length_scale[n] = candidates.r[c], found.log_length_scale[c]
                 columns.z[n] = candidates.z[c] - frame.prior_mean
-                columns.noise[n] = noise_among(by_itself.alike[c], prior.noise)
-                columns.noise[n] += by_itself.doubt[c]
+                columns.noise[n] = noise_among(found.alike[c], prior.noise)
+                columns.noise[n] += found.doubt[c]
                 n += 1
         if n == 0:
             continue
@@ -201,8 +176,8 @@ def _begin(
     m: int,
     noise: float,
     reach: float,
-    from_neighbours: FloatArray,
-    by_itself: SegmentSurfaces,
+    from_neighbours: Evidence,
+    found: SegmentSurfaces,
     columns: _Columns,
 ) -> int:
     """Set heights of the candidates of segment `m`, evidence there, and seeds as the new ones.
@@ -219,18 +194,18 @@ def _begin(
             near += 1
         while far < stop and candidates.r[far] - r <= reach:
             far += 1
-        by_itself.alike[c] = far - near
+        found.alike[c] = far - near
         columns.z[i], columns.noise[i] = z, noise_among(far - near, noise)
         height = precision = 0.0
-        if from_neighbours.shape[1] > 0:
+        if len(from_neighbours.height) > 0:
             j = candidates.bin[c]
-            heights, precisions = from_neighbours[0, m], from_neighbours[1, m]
+            heights, precisions = from_neighbours.height[m], from_neighbours.precision[m]
             height = between_knots(r, knots[j], knots[j + 1], heights[j], heights[j + 1])
             precision = between_knots(r, knots[j], knots[j + 1], precisions[j], precisions[j + 1])
         columns.neighbour_height[i], columns.neighbour_precision[i] = height, precision
         columns.above[i] = contradicts(height, precision, z, noise)
-        by_itself.inlier[c] = False
-        if by_itself.seed[c] and not columns.above[i]:
+        found.inlier[c] = False
+        if found.seed[c] and not columns.above[i]:
             columns.new[n_new] = i
             n_new += 1
     return n_new
@@ -244,15 +219,15 @@ def _grow(
     prior: _Prior,
     growth: GrowthConfig,
     odds: float,
-    by_itself: SegmentSurfaces,
+    found: SegmentSurfaces,
     columns: _Columns,
 ) -> None:
     """Let the new ones join, and those that then fit, until none does."""
     first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
-    inlier = by_itself.inlier[first:stop]
+    inlier = found.inlier[first:stop]
     for i in range(stop - first):
         columns.r[i] = frame.candidates.r[first + i]
-        columns.length_scale[i] = by_itself.log_length_scale[first + i]
+        columns.length_scale[i] = found.log_length_scale[first + i]
     size = _lay_out(stop - first, prior, columns)
     for a in range(n_new):
         i = columns.new[a]

@@ -8,19 +8,24 @@ import numpy as np
 
 from gp_ground_seg.core.compiled.numerics import LANES, solve_in_place
 from gp_ground_seg.core.frame import FloatArray, Frame
+from gp_ground_seg.core.gp import latent
 from gp_ground_seg.core.gp.kernels import squared_exponential
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
-from gp_ground_seg.core.jit import jit
+from gp_ground_seg.core.jit import compiled_form, jit
 
 
-@jit()
+@compiled_form(latent.latent_log_length_scales)
 def latent_log_length_scales(
-    frame: Frame, theta: FloatArray, step: int, at_candidates: FloatArray, at_knots: FloatArray
+    frame: Frame,
+    theta: FloatArray,
+    step: int,
+    log_length_scale: FloatArray,
+    knot_log_length_scale: FloatArray,
 ) -> None:
-    """Do what the twin does for every `step`-th segment, into the last two arrays."""
+    """Do what the twin does."""
     candidates, pseudo, knots = frame.candidates, frame.pseudo, frame.knots
     most = most_bar = 0
-    for m in range(0, len(at_knots), step):
+    for m in range(0, len(knot_log_length_scale), step):
         most = max(most, candidates.offsets[m + 1] - candidates.offsets[m])
         most_bar = max(most_bar, pseudo.offsets[m + 1] - pseudo.offsets[m])
     width = (most + len(knots) + LANES - 1) & -LANES
@@ -30,9 +35,9 @@ def latent_log_length_scales(
     matrix, weight, centres = np.empty((most_bar, width)), np.empty(width), np.empty(width)
     variance = math.exp(2.0 * theta[2])
     single_sharpness = np.float32(0.5 * math.exp(-2.0 * theta[3]))
-    for m in range(0, len(at_knots), step):
+    for m in range(0, len(knot_log_length_scale), step):
         for j in range(len(knots)):
-            at_knots[m, j] = np.nan
+            knot_log_length_scale[m, j] = np.nan
         p, first = pseudo.offsets[m + 1] - pseudo.offsets[m], candidates.offsets[m]
         n = candidates.offsets[m + 1] - first
         if p == 0:
@@ -58,9 +63,9 @@ def latent_log_length_scales(
         for i in range(size):
             value[i] = min(max(value[i], -bound), bound)
         for i in range(n):
-            at_candidates[first + i] = value[i]
+            log_length_scale[first + i] = value[i]
         for i in range(n_wanted):
-            at_knots[m, i] = value[n + i]
+            knot_log_length_scale[m, i] = value[n + i]
 
 
 @jit(part=True)

@@ -93,16 +93,17 @@ def solve_in_place(matrix: FloatArray, n: int, vector: FloatArray) -> bool:
     return True
 
 
-@jit()
-def factorise(a: FloatArray, n: int) -> bool:
-    """Replace the upper triangle of ``a[:n, :n]`` by U, ``A = U^T U``; False if not possible."""
-    stop, one = np.uintp(n), np.uintp(1)
+@jit(part=True)
+def _factorise(a: FloatArray) -> float:
+    """Replace the upper triangle of A by U, ``A = U^T U``; return log |U|, NaN if none is."""
+    stop, one, log_root = np.uintp(len(a)), np.uintp(1), 0.0
     for k in range(stop):
         # Written so that NaN fails too.
         if not a[k, k] > 0.0:
-            return False
+            return math.nan
         pivot = math.sqrt(a[k, k])
         a[k, k] = pivot
+        log_root += math.log(pivot)
         scale = 1.0 / pivot
         for j in range(k + one, stop):
             a[k, j] *= scale
@@ -110,19 +111,21 @@ def factorise(a: FloatArray, n: int) -> bool:
             weight = a[k, i]
             for j in range(i, stop):
                 a[i, j] -= weight * a[k, j]
-    return True
+    return log_root
 
 
-@jit()
-def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray) -> None:
-    """Inverse of ``U^T U``, both triangles, in `inverse`.
-
-    `whitened` is working space; its lower triangle becomes ``U^-T``.
-    """
-    stop, one = np.uintp(n), np.uintp(1)
+@compiled_form(kernels.inverted)
+def inverted(covariance: FloatArray) -> tuple[FloatArray, float]:
+    """Do what the twin does."""
+    factor, shape, log_root = covariance, covariance.shape, _factorise(covariance)
+    stop, one = np.uintp(len(factor)), np.uintp(1)
+    inverse, whitened = np.full(shape, np.nan), np.empty(shape)
+    if math.isnan(log_root):
+        return inverse, log_root
+    # The lower triangle of `whitened` becomes U^-T.
     for i in range(stop):
         for j in range(i + one):
-            whitened[i, j] = 0.0
+            whitened[i, j] = inverse[i, j] = 0.0
         for k in range(i):
             weight = factor[k, i]
             for j in range(k + one):
@@ -131,9 +134,6 @@ def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray
         for j in range(i):
             whitened[i, j] *= scale
         whitened[i, i] = scale
-    for i in range(stop):
-        for j in range(i + one):
-            inverse[i, j] = 0.0
     for k in range(stop):
         for i in range(k + one):
             weight = whitened[k, i]
@@ -142,3 +142,14 @@ def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray
     for i in range(stop):
         for j in range(i):
             inverse[j, i] = inverse[i, j]
+    return inverse, log_root
+
+
+@jit()
+def times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+    """Product of a matrix and a vector."""
+    result = np.zeros(len(matrix))
+    for i in range(np.uintp(len(matrix))):
+        for j in range(np.uintp(len(vector))):
+            result[i] += matrix[i, j] * vector[j]
+    return result

@@ -13,9 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, Frame, Values
+from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, Values
+from gp_ground_seg.core.gp.kernels import prior_variance
+from gp_ground_seg.core.gp.model import SegmentSurfaces
 from gp_ground_seg.core.jit import choose, shared
-from gp_ground_seg.core.parameters.config import Config, GrowthConfig
+from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
 
 STEP = 4
 """One of how many segments shows its ground to those beside it: neighbours see much the same."""
@@ -31,7 +33,10 @@ ODDS = 0.25
 
 
 class Evidence(NamedTuple):
-    """Height of the ground at places of segments, by the segments beside them."""
+    """Height of the ground at places of segments, by the segments beside them.
+
+    Tables (M, K) at the knots; (0, 0) where none is used.
+    """
 
     height: FloatArray  # about the prior mean [m]; 0 where there is no evidence
     precision: FloatArray  # inverse variance [1/m^2]; 0 where there is no evidence
@@ -104,12 +109,6 @@ def between_knots(r: Values, near: Values, far: Values, a: Values, b: Values) ->
 
 
 @shared
-def is_low_and_near(r: Values, z: Values, growth: GrowthConfig) -> Values:
-    """Whether candidates at ranges and heights over the prior mean may be seeds [m]."""
-    return (r <= growth.seed_range) & (np.abs(z) <= growth.seed_height_tolerance)
-
-
-@shared
 def is_on_object(z: Values, highest: Values, sigma_n: Values) -> Values:
     """Whether a candidate is higher than the `highest` ground and its noise explain."""
     return z > highest + sigma_n
@@ -127,30 +126,21 @@ def odds_of(n_standing: Values, n_candidates: Values) -> Values:
     return np.maximum(seen, ODDS)
 
 
-def uses_neighbours_in(frame: Frame, config: Config) -> bool:
-    """Whether segments use their neighbours: without a prior slope a distance tells nothing."""
-    wanted = config.surface.look_aside and config.observation.slope_std > 0.0
-    return wanted and len(frame.knots) > 0
-
-
-def seeds(frame: Frame, theta: FloatArray, config: Config) -> tuple[BoolArray, float]:
-    """Candidates that start the inlier set, (C,) bool, and the odds of obstacles, see `odds_of`.
+def find_seeds(
+    frame: Frame, theta: FloatArray, growth: GrowthConfig, slope_std: float, seed: BoolArray
+) -> float:
+    """Remove candidates that stand on others from `seed` (C,); return the odds of `odds_of`.
 
     Seeds are low and near (``growth.seed_height_tolerance``, ``growth.seed_range``). What stands
     higher over one of these than noise and prior slope explain stands on something. Candidates
     as near as the farthest of them and not in vertical faces count for the odds.
     """
-    candidates, growth = frame.candidates, config.growth
-    z = candidates.z - frame.prior_mean
-    seed: BoolArray = is_low_and_near(candidates.r, z, growth)
-    if not uses_neighbours_in(frame, config):
-        return seed, ODDS
-    max_slope = CLEARLY * config.observation.slope_std
-    highest = highest_ground(frame, z, seed, max_slope)
+    z = frame.candidates.z - frame.prior_mean
+    highest = highest_ground(frame, z, seed, CLEARLY * slope_std)
     stands = is_on_object(z, highest, np.exp(theta[1]))
     counts = np.isfinite(highest) & ~frame.in_face
-    n_standing, n_candidates = np.count_nonzero(stands & counts), np.count_nonzero(counts)
-    return seed & ~stands, float(odds_of(n_standing, n_candidates))
+    seed &= ~stands
+    return float(odds_of(np.count_nonzero(stands & counts), np.count_nonzero(counts)))
 
 
 def highest_ground(frame: Frame, z: FloatArray, seed: BoolArray, max_slope: float) -> FloatArray:
@@ -204,28 +194,33 @@ def _reaches(n_segments: int) -> list[int]:
 
 
 def evidence_of_neighbours(
-    mean: FloatArray, std: FloatArray, prior: FloatArray, knots: FloatArray, slope_std: float
+    mean: FloatArray,
+    std: FloatArray,
+    knots: FloatArray,
+    theta: FloatArray,
+    observation: ObservationConfig,
 ) -> Evidence:
     """Evidence at the knots of every segment from the surfaces of the others, (M, K).
 
     On either side the nearest segment that knows: the standard deviation of its evidence grows
-    by `slope_std` for each metre of arc. See `shown_by` for what a surface shows.
+    with the prior slope for each metre of arc. See `shown_by` for what a surface shows.
 
     Parameters
     ----------
     mean, std : (M, K) float64
         Height about the prior mean and standard deviation of the surface of each segment by
         itself [m]; NaN where there is none.
-    prior : (M, K) float64
-        Variance of the prior [m^2].
     knots : (K,) float64
         Ranges of the knots [m].
-    slope_std : float
-        Standard deviation of the ground's slope.
+    theta : (T,) float64
+        Hyper-parameters of the surfaces.
+    observation : ObservationConfig
+        Prior of the slope.
     """
     with np.errstate(invalid='ignore'):
+        prior = prior_variance(np.exp(2.0 * theta[0]), observation, knots)
         height, deviation = shown_by(mean, std, prior)
-    step = slope_std * 2.0 * math.pi / len(mean) * knots
+    step = observation.slope_std * 2.0 * math.pi / len(mean) * knots
     total, weighted = np.zeros_like(height), np.zeros_like(height)
     for side in (1, -1):
         nearest, nearest_std = _of_nearest(height, deviation, step, side)
@@ -250,14 +245,29 @@ def _of_nearest(
     return height, deviation
 
 
-def at_candidates(
-    from_neighbours: Evidence, candidates: Candidates, knots: FloatArray
-) -> Evidence:
-    """Evidence at the candidates, (C,): linear between the knots about each."""
+def at_candidates(from_neighbours: Evidence, frame: Frame) -> Evidence:
+    """Evidence at the candidates, (C,): linear between the knots about each; 0 without any."""
+    knots, candidates = frame.knots, frame.candidates
     r, segment, near = candidates.r, candidates.segment, candidates.bin
+    if len(from_neighbours.height) == 0:
+        return Evidence(*np.zeros((2, len(r))))
     far = near + 1
     height, precision = (
         between_knots(r, knots[near], knots[far], table[segment, near], table[segment, far])
         for table in from_neighbours
     )
     return Evidence(height, precision)
+
+
+def join_evidence(
+    found: SegmentSurfaces,
+    from_neighbours: Evidence,
+    knots: FloatArray,
+    theta: FloatArray,
+    observation: ObservationConfig,
+) -> None:
+    """Make the surface of each segment that of it and the evidence together."""
+    mean, std, is_unknown = found.mean, found.std, np.isnan(found.knot_log_length_scale)
+    prior = prior_variance(np.exp(2.0 * theta[0]), observation, knots)
+    mean[:], std[:] = combined_surface(mean, std, prior, *from_neighbours)
+    mean[is_unknown] = std[is_unknown] = np.nan

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,15 +18,15 @@ from gp_ground_seg.core.frame import (
     Values,
 )
 from gp_ground_seg.core.gp.evidence import (
+    ODDS,
     STEP,
     Evidence,
     at_candidates,
     combined,
-    combined_surface,
     contradicts,
     evidence_of_neighbours,
-    seeds,
-    uses_neighbours_in,
+    find_seeds,
+    join_evidence,
 )
 from gp_ground_seg.core.gp.kernels import (
     Padded,
@@ -37,26 +39,28 @@ from gp_ground_seg.core.gp.kernels import (
     prior_variance,
     single_threaded_blas,
 )
-from gp_ground_seg.core.gp.latent import given_theta, log_length_scales
+from gp_ground_seg.core.gp.latent import (
+    given_log_length_scales,
+    given_theta,
+    latent_log_length_scales,
+)
+from gp_ground_seg.core.gp.model import Model, SegmentSurfaces
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, GrowthConfig, ObservationConfig
 from gp_ground_seg.core.pipeline.lines import is_walkable
 
 
-@single_threaded_blas()
 def estimate_surface(
-    frame: Frame, theta: FloatArray, config: Config
+    frame: Frame,
+    theta: FloatArray,
+    config: Config,
+    fit: Callable[..., None] | None = None,
 ) -> tuple[GroundSurface, FloatArray, FloatArray]:
     """Inliers that grow from low, near candidates, and the surface that rests on them.
 
     The inliers grow under the values of theta that the configuration gives (see `grow_inliers`).
     The surface is the regression on them under `theta`: what is learned from inliers does not
     choose them. Its height and variance are the paper's eqs. 6 and 7.
-
-    With ``surface.look_aside`` one of `STEP` segments grows by itself first. Then all grow: the
-    prediction is that of the segment and of those beside it together, and what stands above the
-    latter alone does not start the set (see `gp_ground_seg.core.gp.evidence`). The surface, too,
-    is that of the segment and of those beside it together.
 
     Parameters
     ----------
@@ -66,6 +70,8 @@ def estimate_surface(
         Hyper-parameters of the frame (see `gp_ground_seg.core.gp.learning`).
     config : Config
         Model of the length-scale, prior of the line, gates.
+    fit : callable, optional
+        `fit_surfaces`, compiled.
 
     Returns
     -------
@@ -76,33 +82,46 @@ def estimate_surface(
     log_length_scale : (C,) float64
         At the candidates [log m].
     """
-    candidates, knots, given = frame.candidates, frame.knots, given_theta(config)
-    everywhere = np.arange(candidates.n_segments)
-    uses_neighbours = uses_neighbours_in(frame, config)
-    from_neighbours = Evidence(*np.zeros((2, len(candidates.r))))
-    seed, odds = seeds(frame, given, config)
-    scales = log_length_scales(frame, given, config)
+    found = SegmentSurfaces.to_be_set(frame, config)
+    (fit or single_threaded_blas()(fit_surfaces))(
+        frame, given_theta(config), theta, Model.of(frame, config), found
+    )
+    surface = GroundSurface(frame.knots, found.mean, found.std, found.inlier)
+    return surface, found.knot_log_length_scale, found.log_length_scale
 
-    def evidence(mean: FloatArray, std: FloatArray, theta: FloatArray) -> tuple[Any, ...]:
-        prior = prior_variance(variances_of(theta)[0], config.observation, knots)
-        slope_std = config.observation.slope_std
-        return prior, evidence_of_neighbours(mean, std, prior, knots, slope_std)
 
-    if uses_neighbours:
-        few = everywhere[::STEP]
-        inliers = grow_inliers(frame, few, seed, odds, from_neighbours, scales[0], config)
-        _, shown = evidence(*_regress(frame, few, inliers, given, *scales, config), given)
-        from_neighbours = at_candidates(shown, candidates, knots)
-    inliers = grow_inliers(frame, everywhere, seed, odds, from_neighbours, scales[0], config)
-    if not np.array_equal(theta[2:], given[2:]):
-        scales = log_length_scales(frame, theta, config)
-    u, knot_u = scales
-    mean, std = _regress(frame, everywhere, inliers, theta, u, knot_u, config)
-    if uses_neighbours:
-        prior, shown = evidence(mean, std, theta)
-        mean, std = combined_surface(mean, std, prior, *shown)
-        mean[np.isnan(knot_u)] = std[np.isnan(knot_u)] = np.nan
-    return GroundSurface(knots, mean + frame.prior_mean, std, inliers.inlier), knot_u, u
+@shared
+def fit_surfaces(
+    frame: Frame, given: FloatArray, theta: FloatArray, model: Model, found: SegmentSurfaces
+) -> None:
+    """Set the inliers and surfaces of all segments; `given` (T,) is `given_theta`.
+
+    Where neighbours are used, one of `STEP` segments grows by itself first. Then all grow: the
+    prediction is that of the segment and of those beside it together, and what stands above the
+    latter alone does not start the set (see `gp_ground_seg.core.gp.evidence`). The surface, too,
+    is that of the segment and of those beside it together.
+    """
+    knots, mean, std = frame.knots, found.mean, found.std
+    u, knot_u = found.log_length_scale, found.knot_log_length_scale
+    observation, growth, odds = model.observation, model.growth, ODDS
+    if model.is_latent:
+        latent_log_length_scales(frame, given, 1, u, knot_u)
+    if model.uses_neighbours:
+        odds = find_seeds(frame, given, growth, observation.slope_std, found.seed)
+    odds = odds if model.by_roughness else 0.0
+    from_neighbours = Evidence(np.empty((0, 0)), np.empty((0, 0)))
+    if model.uses_neighbours:
+        grow_inliers(frame, given, model, odds, from_neighbours, STEP, found)
+        regress(frame, given, observation, STEP, found)
+        from_neighbours = evidence_of_neighbours(mean, std, knots, given, observation)
+    grow_inliers(frame, given, model, odds, from_neighbours, 1, found)
+    if model.is_latent and (theta[2:] != given[2:]).any():
+        latent_log_length_scales(frame, theta, 1, u, knot_u)
+    regress(frame, theta, observation, 1, found)
+    if model.uses_neighbours:
+        from_neighbours = evidence_of_neighbours(mean, std, knots, theta, observation)
+        join_evidence(found, from_neighbours, knots, theta, observation)
+    mean += frame.prior_mean
 
 
 OBSTACLE_DEPTH = 1.0
@@ -118,14 +137,6 @@ RISES_ON = 0.8
 """Part of the slope to a candidate with which the ground behind it must rise on."""
 
 
-class Grown(NamedTuple):
-    """Inliers of segments."""
-
-    inlier: BoolArray  # (C,) candidates that the surface rests on
-    alike: IntArray  # (C,) candidates close to each, itself as well, see `noise_among`
-    doubt: FloatArray  # (C,) variance by which an inlier may be an obstacle [m^2]
-
-
 @shared
 def fits(
     z: Values, height: Values, variance: Values, noise: Values, growth: GrowthConfig
@@ -137,16 +148,16 @@ def fits(
 
 
 @shared
-def variances_of(theta: Values) -> tuple[Values, Values]:
-    """Variances of the process and of its noise by theta [m^2]."""
-    return np.exp(2.0 * theta[0]), np.exp(2.0 * theta[1])
+def variances_of(
+    frame: Frame, theta: FloatArray, observation: ObservationConfig, least: float
+) -> tuple[float, float]:
+    """Variances of the process and of its noise by theta [m^2].
 
-
-def _variances(frame: Frame, theta: FloatArray, config: Config, least: float) -> tuple[Any, Any]:
-    """`variances_of` theta; that of the noise is at least the rounding of covariances."""
-    sill, noise = variances_of(theta)
-    farthest = frame.candidates.r.max(initial=0.0)
-    return sill, max(noise, least * prior_variance(sill, config.observation, farthest))
+    That of the noise is at least the rounding of covariances, `least` of the largest.
+    """
+    sill, noise, r = math.exp(2.0 * theta[0]), math.exp(2.0 * theta[1]), frame.candidates.r
+    farthest = r.max() if len(r) > 0 else 0.0
+    return sill, max(noise, least * prior_variance(sill, observation, farthest))
 
 
 @shared
@@ -184,15 +195,17 @@ def posterior_covariance(
     """
     candidates, n = frame.candidates, int(np.isfinite(surface.mean[m]).sum())
     own = np.flatnonzero(surface.inlier & (candidates.segment == m))
-    u, knot_u = log_length_scales(frame, theta, config)
+    u, knot_u = given_log_length_scales(frame, config.length_scale)
+    if config.length_scale.model == 'latent':
+        latent_log_length_scales(frame, theta, 1, u, knot_u)
     r = np.concatenate([candidates.r[own], frame.knots[:n]])
     l = np.exp(np.concatenate([u[own], knot_u[m, :n]]))  # noqa: E741
-    sill, noise = _variances(frame, theta, config, ROUNDING)
+    sill, noise = variances_of(frame, theta, config.observation, ROUNDING)
     prior = paciorek(r[:, None], l[:, None], r, l, sill)
     prior += line_covariance(r[:, None], r, *line_variances(config.observation))
     reach = np.exp(given_theta(config)[3]) if config.label.rule == 'roughness' else 0.0
-    noise = np.diag(noise_among(_count_near(candidates, reach)[own], noise))
-    given, cross = prior[: len(own), : len(own)] + noise, prior[: len(own), len(own) :]
+    noises = noise_among(_count_near(candidates, reach)[own], noise)
+    given, cross = prior[: len(own), : len(own)] + np.diag(noises), prior[: len(own), len(own) :]
     cov = prior[len(own) :, len(own) :] - cross.T @ np.linalg.solve(given, cross)
     scale = surface.std[m, :n] / np.sqrt(np.diag(cov))
     result: FloatArray = cov * np.outer(scale, scale)
@@ -221,14 +234,14 @@ def noise_in_doubt(
 
 def grow_inliers(
     frame: Frame,
-    segments: IntArray,
-    seed: BoolArray,
+    theta: FloatArray,
+    model: Model,
     odds: float,
     from_neighbours: Evidence,
-    u: FloatArray,
-    config: Config,
-) -> Grown:
-    """Inliers of `segments`, which grow from seeds under the given hyper-parameters.
+    step: int,
+    found: SegmentSurfaces,
+) -> None:
+    """Let the inliers of every `step`-th segment grow from seeds, in `found`, under `theta`.
 
     A candidate joins when the predictive standard deviation, or the residual, is at most
     ``growth.max_std``, and the standardised residual at most
@@ -236,41 +249,37 @@ def grow_inliers(
     before (see `carries_on`). This repeats until none joins (GP-INSAC of Chen et al. 2014; the
     paper's outlier rejection).
 
-    `seed` (C,) and `odds` are of `seeds`, `from_neighbours` (C,) is the evidence of the segments
-    beside each, `u` (C,) are log length-scales.
+    `from_neighbours` is the evidence of the segments beside each. Unless `odds`, of `odds_of`, are
+    0, a candidate among others, or that joins in doubt, shows less: see `noise_among` and
+    `noise_in_doubt`.
     """
-    candidates, given = frame.candidates, given_theta(config)
-    z = candidates.z - frame.prior_mean
-    sill, gate_noise = _variances(frame, given, config, ROUNDING_SINGLE)
-    r, length_scale = candidates.r.astype(np.float32), np.exp(u).astype(np.float32)
-    odds = odds if config.label.rule == 'roughness' else 0.0
-    alike = _count_near(candidates, np.exp(given[3]) if odds > 0.0 else 0.0)
-    noise = noise_among(alike, gate_noise)
-    above = contradicts(*from_neighbours, z, gate_noise)
-    grown = Grown(np.zeros(len(z), np.bool_), alike, np.zeros(len(z)))
-    size = candidates.offsets[segments + 1] - candidates.offsets[segments]
-    for batch in batches(np.concatenate([[0], np.cumsum(size)])):
-        layout = Padded.of(segments[batch], candidates.offsets)
+    candidates, z = frame.candidates, frame.candidates.z - frame.prior_mean
+    sill, gate_noise = variances_of(frame, theta, model.observation, ROUNDING_SINGLE)
+    found.alike[:] = _count_near(candidates, np.exp(theta[3]) if odds > 0.0 else 0.0)
+    noise, beside = noise_among(found.alike, gate_noise), at_candidates(from_neighbours, frame)
+    above = contradicts(*beside, z, gate_noise)
+    found.inlier[:], found.doubt[:] = False, 0.0
+    for segments in batches(np.arange(0, candidates.n_segments, step), candidates.offsets):
+        layout = Padded.of(segments, candidates.offsets)
         place, mask = layout.place, layout.mask
         state = _Batch(
-            layout.take(r),
-            layout.take(length_scale, 1.0),
-            float(sill),
-            config.observation,
+            layout.take(candidates.r).astype(np.float32),
+            np.exp(layout.take(found.log_length_scale)).astype(np.float32),
+            sill,
+            model.observation,
             layout.take(z),
             gate_noise,
             layout.take(noise),
             mask,
-            (seed & ~above)[place] & mask,
+            (found.seed & ~above)[place] & mask,
             layout.take(frame.onward, -np.inf),
             frame.in_face[place],
             above[place],
-            Evidence(layout.take(from_neighbours.height), layout.take(from_neighbours.precision)),
+            Evidence(layout.take(beside.height), layout.take(beside.precision)),
         )
-        chosen = _grow(state, config.growth, odds)
-        grown.inlier[place[mask]] = chosen[mask]
-        grown.doubt[place[mask]] = state.noise[mask] - noise[place[mask]]
-    return grown
+        chosen = _grow(state, model.growth, odds)
+        found.inlier[place[mask]] = chosen[mask]
+        found.doubt[place[mask]] = state.noise[mask] - noise[place[mask]]
 
 
 class _Batch(NamedTuple):
@@ -402,31 +411,25 @@ def _condition(
     return np.concatenate([whitened, rows], axis=1)
 
 
-def _regress(
+def regress(
     frame: Frame,
-    segments: IntArray,
-    inliers: Grown,
     theta: FloatArray,
-    u: FloatArray,
-    knot_u: FloatArray,
-    config: Config,
-) -> tuple[FloatArray, FloatArray]:
-    """Surface of `segments` by themselves, by their inliers and `theta`.
-
-    `u` (C,) and `knot_u` (M, K) are log length-scales at the candidates and knots. Returns height
-    about the prior mean and standard deviation at the knots, (M, K) [m], NaN where there is none.
-    """
-    candidates, which = frame.candidates, np.flatnonzero(inliers.inlier)
-    mean, std = np.full((2, *knot_u.shape), np.nan)
-    sill, noise = _variances(frame, theta, config, ROUNDING)
-    line = line_variances(config.observation)
-    r, z, length_scale = candidates.r, candidates.z - frame.prior_mean, np.exp(u)
-    noise = noise_among(inliers.alike, noise) + inliers.doubt
-    r, z, length_scale, noise = r[which], z[which], length_scale[which], noise[which]
+    observation: ObservationConfig,
+    step: int,
+    found: SegmentSurfaces,
+) -> None:
+    """Surface of every `step`-th segment by its own inliers and `theta`, into `found`."""
+    candidates, knot_u = frame.candidates, found.knot_log_length_scale
+    which = np.flatnonzero(found.inlier)
+    segments = np.arange(0, candidates.n_segments, step)
+    sill, noise = variances_of(frame, theta, observation, ROUNDING)
+    line = line_variances(observation)
+    noise = (noise_among(found.alike, noise) + found.doubt)[which]
+    r, z = candidates.r[which], candidates.z[which] - frame.prior_mean
+    length_scale = np.exp(found.log_length_scale[which])
     offsets = np.searchsorted(which, candidates.offsets)
-    size = offsets[segments + 1] - offsets[segments]
-    for batch in batches(np.concatenate([[0], np.cumsum(size)])):
-        own = segments[batch]
+    found.mean[segments] = found.std[segments] = np.nan
+    for own in batches(segments, offsets):
         layout = Padded.of(own, offsets)
         own_r, own_l = layout.take(r)[:, :, None], layout.take(length_scale, 1.0)[:, :, None]
         is_wanted = np.isfinite(knot_u[own])
@@ -440,8 +443,8 @@ def _regress(
         rows = paciorek(own_r, own_l, knots, knot_l, sill) + line_covariance(own_r, knots, *line)
         rows = np.matmul(unit, rows)
         height = np.matmul(np.matmul(unit, layout.take(z)[:, :, None]).swapaxes(1, 2), rows)[:, 0]
-        variance = prior_variance(sill, config.observation, knots)
+        variance = prior_variance(sill, observation, knots)
         variance = variance - np.einsum('sij,sij->sj', rows, rows)
-        mean[own, :n_knots] = np.where(is_wanted, height, np.nan)
-        std[own, :n_knots] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
-    return mean, std
+        found.mean[own, :n_knots] = np.where(is_wanted, height, np.nan)
+        std = np.sqrt(np.maximum(variance, 0.0))
+        found.std[own, :n_knots] = np.where(is_wanted, std, np.nan)

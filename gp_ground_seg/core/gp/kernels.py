@@ -106,11 +106,11 @@ class Padded(NamedTuple):
         return np.where(self.mask, values[self.place], fill)
 
 
-def batches(offsets: IntArray) -> list[IntArray]:
-    """Group the segments that are not empty, those of similar size together."""
-    size = np.diff(offsets)
+def batches(segments: IntArray, offsets: IntArray) -> list[IntArray]:
+    """Group those of the `segments` that are not empty, those of similar size together."""
+    size = offsets[segments + 1] - offsets[segments]
     order = np.argsort(size, kind='stable')
-    order = order[size[order] > 0]
+    order = segments[order[size[order] > 0]]
     n_batches = -(-len(order) // SEGMENTS_PER_BATCH)
     return np.array_split(order, n_batches) if n_batches else []
 
@@ -136,6 +136,19 @@ def inverse_of_lower(factors: FloatArray) -> FloatArray:
     # LAPACK takes arrays by columns: our rows are to it the columns of an upper triangle.
     invert = get_lapack_funcs('trtri', (factors,))
     return np.array([invert(factor.T)[0].T for factor in factors])
+
+
+def inverted(covariance: FloatArray) -> tuple[FloatArray, float]:
+    """Inverse of a covariance (n, n), and half the logarithm of its determinant.
+
+    NaN where it is not positive definite. Compiled code reads, and overwrites, its upper triangle.
+    """
+    try:
+        factor = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return np.full_like(covariance, np.nan), np.nan
+    inverse: Any = np.linalg.inv(covariance)
+    return inverse, float(np.log(np.diagonal(factor)).sum())
 
 
 @functools.cache

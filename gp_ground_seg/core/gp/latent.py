@@ -30,15 +30,6 @@ def given_theta(config: Config) -> FloatArray:
     return np.append(np.log(values), np.zeros(n_factors))
 
 
-def log_length_scales(
-    frame: Frame, theta: FloatArray, config: Config
-) -> tuple[FloatArray, FloatArray]:
-    """Log length-scales by the model of the configuration, as of `latent_log_length_scales`."""
-    if config.length_scale.model == 'latent':
-        return latent_log_length_scales(frame, theta)
-    return given_log_length_scales(frame, config.length_scale)
-
-
 def n_wanted_knots(frame: Frame) -> IntArray:
     """Count the knots up to the bin of the last candidate of each segment, (M,) int64.
 
@@ -47,23 +38,27 @@ def n_wanted_knots(frame: Frame) -> IntArray:
     return np.minimum(frame.candidates.n_edges, len(frame.knots))
 
 
-def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean of the latent process at the candidates and knots (paper, eqs. 10 and 11).
+def latent_log_length_scales(
+    frame: Frame,
+    theta: FloatArray,
+    step: int,
+    log_length_scale: FloatArray,
+    knot_log_length_scale: FloatArray,
+) -> None:
+    """Mean of the latent process at candidates and knots (paper, eqs. 10 and 11).
 
     The pseudo-inputs are centred on their mean, so that equal ones give that very value
     everywhere.
 
-    `theta`, (T,), are the hyper-parameters (see `gp_ground_seg.core.gp.learning`).
-    Returns log length-scales at the candidates, (C,), and at the knots, (M, K) [log m]; NaN there
-    behind the bin of the last candidate.
+    `theta`, (T,), are the hyper-parameters (see `gp_ground_seg.core.gp.learning`). Sets the log
+    length-scales of every `step`-th segment at the candidates, (C,), and at the knots, (M, K)
+    [log m]; NaN there behind the bin of the last candidate.
     """
-    candidates, pseudo = frame.candidates, frame.pseudo
-    n_knots = n_wanted_knots(frame)
+    candidates, pseudo, n_knots = frame.candidates, frame.pseudo, n_wanted_knots(frame)
     sill_bar, square_l_bar, noise_bar = np.exp(2.0 * theta[2:5])
-    kernel = sill_bar, 0.5 / square_l_bar
-    at_candidates = np.empty(len(candidates.r))
-    at_knots = np.full((candidates.n_segments, len(frame.knots)), np.nan)
-    for segments in batches(candidates.offsets):
+    kernel, bound = (sill_bar, 0.5 / square_l_bar), MAX_ABS_LOG_LENGTH_SCALE
+    knot_log_length_scale[::step] = np.nan
+    for segments in batches(np.arange(0, candidates.n_segments, step), candidates.offsets):
         layout = Padded.of(segments, candidates.offsets)
         bar = Padded.of(segments, pseudo.offsets)
         r, r_bar = layout.take(candidates.r)[:, :, None], bar.take(pseudo.r_bar)
@@ -75,31 +70,32 @@ def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArra
         centred = np.where(bar.mask, l_bar - mean, 0.0)
         weight = np.linalg.solve(covariance, centred[:, :, None])
         cross = squared_exponential(r, r_bar[:, None, :], *kernel)
-        found = (cross @ weight)[:, :, 0] + mean
-        at_candidates[layout.place[layout.mask]] = found[layout.mask]
+        found = np.clip((cross @ weight)[:, :, 0] + mean, -bound, bound)
+        log_length_scale[layout.place[layout.mask]] = found[layout.mask]
         knots = frame.knots[: n_knots[segments].max()]
         cross = squared_exponential(knots[:, None], r_bar[:, None, :], *kernel)
         is_wanted = np.arange(len(knots)) < n_knots[segments, None]
-        found = (cross @ weight)[:, :, 0] + mean
-        at_knots[segments, : len(knots)] = np.where(is_wanted, found, np.nan)
-    bound = MAX_ABS_LOG_LENGTH_SCALE
-    return np.clip(at_candidates, -bound, bound), np.clip(at_knots, -bound, bound)
+        found = np.clip((cross @ weight)[:, :, 0] + mean, -bound, bound)
+        knot_log_length_scale[segments, : len(knots)] = np.where(is_wanted, found, np.nan)
 
 
 def given_log_length_scales(
     frame: Frame, length_scale: LengthScaleConfig
 ) -> tuple[FloatArray, FloatArray]:
-    """Log length-scales without a latent process; returns as `latent_log_length_scales`.
+    """Log length-scales at the candidates, (C,), and at the knots, (M, K) [log m].
 
-    One constant, or those of the lines: linear between the candidates.
+    One constant, or those of the lines: linear between the candidates. Arbitrary ones, to be set,
+    where the model is the latent process.
     """
     candidates, knots, n_knots = frame.candidates, frame.knots, n_wanted_knots(frame)
+    at_knots = np.full((len(n_knots), len(knots)), np.nan)
+    if length_scale.model == 'latent':
+        return np.empty(len(candidates.r)), at_knots
     if length_scale.model == 'constant':
         u = np.full(len(candidates.r), np.log(length_scale.constant))
     else:
         of_lines = line_gradient_length_scale(frame.lines.slope, length_scale)
         u = np.log(of_lines)[frame.lines.line]
-    at_knots = np.full((len(n_knots), len(knots)), np.nan)
     for m in np.flatnonzero(n_knots):
         inside, n = slice(candidates.offsets[m], candidates.offsets[m + 1]), n_knots[m]
         at_knots[m, :n] = np.interp(knots[:n], candidates.r[inside], u[inside])

@@ -13,23 +13,19 @@ L-BFGS-B takes longer between two evaluations than most evaluations take.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import (
-    BoolArray,
-    FloatArray,
-    Frame,
-    Inliers,
-    PseudoInputs,
-    Values,
-)
-from gp_ground_seg.core.gp.evidence import Evidence, seeds
+from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, Inliers, Values
+from gp_ground_seg.core.gp.evidence import ODDS, Evidence
 from gp_ground_seg.core.gp.ground import grow_inliers
-from gp_ground_seg.core.gp.latent import given_theta, log_length_scales
+from gp_ground_seg.core.gp.kernels import single_threaded_blas
+from gp_ground_seg.core.gp.latent import given_theta, latent_log_length_scales
 from gp_ground_seg.core.gp.likelihood import log_likelihood
+from gp_ground_seg.core.gp.model import Model, SegmentSurfaces
 from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import Config, ObservationConfig
 from gp_ground_seg.core.pipeline.lines import N_CLASSES, class_middles
@@ -119,77 +115,68 @@ class Learned(NamedTuple):
         return cls(theta, math.nan, 0, 'kept', np.zeros(len(theta), np.bool_))
 
 
-def learn_frame(frame: Frame, config: Config) -> Learned:
+def learn_frame(frame: Frame, config: Config, fit: Callable[..., int] | None = None) -> Learned:
     """Learn theta on the inliers that grow under the values given, of some segments.
 
-    These are every ``learning.segment_step``-th, each by itself.
+    These are every ``learning.segment_step``-th, each by itself. `fit` is `fit_theta`, compiled.
     """
-    learning, space, theta = config.learning, theta_space(config), given_theta(config)
-    thin = every_segment(frame, learning.segment_step)
-    has_latent = bool(space.free[2:].any())
-    everywhere, outcome = np.arange(thin.candidates.n_segments), np.empty(2)
-    seed, odds = seeds(thin, theta, config)
-    nothing = Evidence(*np.zeros((2, len(seed))))
-    u, _ = log_length_scales(thin, theta, config)
-    grown = grow_inliers(thin, everywhere, seed, odds, nothing, u, config)
-    inliers = take_inliers(thin, grown.inlier, u, has_latent)
-    is_map, most = learning.objective == 'map', learning.max_evaluations
-    n = maximise(space, inliers, config.observation, is_map, most, theta, outcome)
+    space, theta, outcome = theta_space(config), given_theta(config), np.empty(2)
+    no_knots = frame._replace(knots=frame.knots[:0])
+    found = SegmentSurfaces.to_be_set(no_knots, config)
+    n = (fit or single_threaded_blas()(fit_theta))(
+        no_knots, space, Model.of(no_knots, config), found, theta, outcome
+    )
     return Learned.of(theta, float(outcome[0]), n, int(outcome[1]), space)
 
 
-def every_segment(frame: Frame, step: int) -> Frame:
-    """Frame without knots, and with candidates in every `step`-th segment only."""
-    candidates, pseudo = frame.candidates, frame.pseudo
-    is_used = np.arange(candidates.n_segments) % step == 0
-    kept = is_used[candidates.segment]
-    kept_bar = np.repeat(is_used, np.diff(pseudo.offsets))
-    return frame._replace(
-        candidates=candidates.where(kept),
-        lines=frame.lines._replace(line=frame.lines.line[kept]),
-        pseudo=PseudoInputs(
-            pseudo.r_bar[kept_bar],
-            pseudo.log_extent[kept_bar],
-            np.concatenate([[0], np.cumsum(kept_bar)])[pseudo.offsets],
-            pseudo.line[kept_bar],
-            pseudo.kind[kept_bar],
-        ),
-        onward=frame.onward[kept],
-        in_face=frame.in_face[kept],
-        knots=frame.knots[:0],
-    )
-
-
-def take_inliers(frame: Frame, inlier: BoolArray, u: FloatArray, has_latent: bool) -> Inliers:
-    """Inliers of a frame.
-
-    `inlier` (C,) says which candidates they are, `u` (C,) are log length-scales there [log m].
-    With `has_latent` the pseudo-inputs go with them, and give the length-scales instead of `u`.
-    """
-    candidates, pseudo = frame.candidates, frame.pseudo
-    taken = np.concatenate([[0], np.cumsum(inlier)])
-    return Inliers(
-        offsets=taken[candidates.offsets],
-        r=candidates.r[inlier],
-        z=candidates.z[inlier] - frame.prior_mean,
-        log_length_scale=u[inlier],
-        bar_offsets=pseudo.offsets if has_latent else np.zeros_like(candidates.offsets),
-        r_bar=pseudo.r_bar,
-        log_extent=pseudo.log_extent,
-        kind=pseudo.kind,
-    )
-
-
-def set_likelihood(
+@shared
+def fit_theta(
+    frame: Frame,
+    space: ThetaSpace,
+    model: Model,
+    found: SegmentSurfaces,
     theta: FloatArray,
-    inliers: Inliers,
-    observation: ObservationConfig,
-    latent_terms: bool,
-    gradient: FloatArray,
-) -> float:
-    """Return the value of `log_likelihood`, and set its `gradient` (T,)."""
-    value, gradient[:] = log_likelihood(theta, inliers, observation, latent_terms)
-    return value
+    outcome: FloatArray,
+) -> int:
+    """Set `theta` (T,), which holds the given values; for `outcome` and the result see `maximise`.
+
+    The frame has no knots; `found` is overwritten.
+    """
+    learning, step = model.learning, model.learning.segment_step
+    u, knot_u = found.log_length_scale, found.knot_log_length_scale
+    if model.is_latent:
+        latent_log_length_scales(frame, theta, step, u, knot_u)
+    nothing = Evidence(np.empty((0, 0)), np.empty((0, 0)))
+    grow_inliers(frame, theta, model, ODDS if model.by_roughness else 0.0, nothing, step, found)
+    inliers = take_inliers(frame, step, bool(space.free[2:].any()), found)
+    budget = learning.max_evaluations
+    return maximise(space, inliers, model.observation, model.is_map, budget, theta, outcome)
+
+
+@shared
+def take_inliers(frame: Frame, step: int, has_latent: bool, found: SegmentSurfaces) -> Inliers:
+    """Inliers of every `step`-th segment; with `has_latent` pseudo-inputs give length-scales."""
+    candidates, pseudo, n = frame.candidates, frame.pseudo, 0
+    offsets = np.zeros(len(candidates.offsets), np.int64)
+    own = np.empty(len(candidates.r), np.int64)
+    for m in range(len(offsets) - 1):
+        if m % step == 0:
+            for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
+                if found.inlier[c]:
+                    own[n] = c
+                    n += 1
+        offsets[m + 1] = n
+    own = own[:n]
+    return Inliers(
+        offsets,
+        candidates.r[own],
+        candidates.z[own] - frame.prior_mean,
+        found.log_length_scale[own],
+        pseudo.offsets if has_latent else np.zeros(len(offsets), np.int64),
+        pseudo.r_bar,
+        pseudo.log_extent,
+        pseudo.kind,
+    )
 
 
 @shared
@@ -208,7 +195,7 @@ def maximise(
     objective and the place of the status in `STATUSES`, and returns the number of evaluations.
     """
     n_data, any_free = len(inliers.r), False
-    slope, lower, upper = np.empty(len(theta)), np.empty(len(theta)), np.empty(len(theta))
+    lower, upper = np.empty(len(theta)), np.empty(len(theta))
     for i in range(len(theta)):
         theta[i] = min(max(theta[i], space.lower[i]), space.upper[i])
         any_free |= space.free[i]
@@ -222,7 +209,7 @@ def maximise(
     while n_evaluations < max_evaluations:
         for i in range(len(theta)):
             theta[i] = search.trial[i]
-        value = set_likelihood(theta, inliers, observation, not is_map, slope)
+        value, slope = log_likelihood(theta, inliers, observation, not is_map)
         for i in range(len(theta)):
             if not space.free[i]:
                 slope[i] = 1.0  # it stays at its upper bound

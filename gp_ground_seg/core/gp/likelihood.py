@@ -1,4 +1,7 @@
-"""Log marginal likelihood of a whole frame and its gradient, segment by segment."""
+"""Log marginal likelihood of a whole frame and its gradient, segment by segment.
+
+Compiled code has loops in place of all but `log_likelihood`.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +12,20 @@ import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Inliers, IntArray
 from gp_ground_seg.core.gp.kernels import (
+    inverted,
     line_covariance,
     line_variances,
     paciorek,
-    single_threaded_blas,
     squared_exponential,
 )
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
+from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import ObservationConfig
 
-_LOG_2PI = math.log(2.0 * math.pi)
+LOG_2PI = math.log(2.0 * math.pi)
 
 
-@single_threaded_blas()
+@shared
 def log_likelihood(
     theta: FloatArray, inliers: Inliers, observation: ObservationConfig, latent_terms: bool
 ) -> tuple[float, FloatArray]:
@@ -38,133 +42,106 @@ def log_likelihood(
     `theta`, (T,).
     """
     value, gradient = 0.0, np.zeros(len(theta))
-    try:
-        for m in np.flatnonzero(np.diff(inliers.offsets)).tolist():
-            value += _add_segment(theta, gradient, inliers, m, observation, latent_terms)
-    except np.linalg.LinAlgError:
-        value = -math.inf
+    for m in range(len(inliers.offsets) - 1):
+        own = slice(inliers.offsets[m], inliers.offsets[m + 1])
+        bar = slice(inliers.bar_offsets[m], inliers.bar_offsets[m + 1])
+        r, z, u = inliers.r[own], inliers.z[own], inliers.log_length_scale[own]
+        if len(r) > 0 and bar.start == bar.stop:
+            value += observe(theta, gradient, r, z, u, observation)[0]
+        elif len(r) > 0:
+            bars = inliers.r_bar[bar], inliers.log_extent[bar], inliers.kind[bar]
+            latent = predict(theta, *bars, r)
+            own_value, g = observe(theta, gradient, r, z, latent.u, observation)
+            value += own_value + add_latent(theta, gradient, latent, r, g, latent_terms)
     if not math.isfinite(value):
         return -math.inf, np.zeros(len(theta))
     return value, gradient
 
 
-def _add_segment(
+def observe(
     theta: FloatArray,
     gradient: FloatArray,
-    inliers: Inliers,
-    m: int,
+    r: FloatArray,
+    z: FloatArray,
+    u: FloatArray,
     observation: ObservationConfig,
-    latent_terms: bool,
-) -> float:
-    """Value of segment `m`; adds to `gradient`. Letters are those of the paper."""
-    own = slice(inliers.offsets[m], inliers.offsets[m + 1])
-    r, z, u = inliers.r[own], inliers.z[own], inliers.log_length_scale[own]
-    has_latent = inliers.bar_offsets[m + 1] > inliers.bar_offsets[m]
-    latent = _Latent.of(theta, inliers, m, r) if has_latent else None
-    if latent is not None:
-        u = latent.u
+) -> tuple[float, FloatArray]:
+    """Value of the heights (n,) at ranges (n,) with log length-scales (n,).
 
+    Adds to `gradient`, and returns the derivatives of the value in log k too, (n, n).
+    """
     sigma_f, sigma_n = np.exp(theta[:2])
     length_scale = np.exp(u)
     k = paciorek(r[:, None], length_scale[:, None], r, length_scale, sigma_f**2)
     covariance = k + line_covariance(r[:, None], r, *line_variances(observation))
     covariance += sigma_n**2 * np.eye(len(r))
-    factor = np.linalg.cholesky(covariance)
-    a_inverse = np.linalg.inv(covariance)
-    alpha = a_inverse @ z
-    log_determinant = 2.0 * np.log(np.diagonal(factor)).sum()
-    value = -0.5 * float(z @ alpha + log_determinant + len(r) * _LOG_2PI)
-
+    inverse, log_root = inverted(covariance)
+    alpha = inverse @ z
+    value = -0.5 * float(z @ alpha + len(r) * LOG_2PI) - log_root
     # G = (alpha alpha^T - A^-1) / 2 is the derivative of the value in A.
-    g = 0.5 * (np.outer(alpha, alpha) - a_inverse)
+    g: FloatArray = 0.5 * (np.outer(alpha, alpha) - inverse)
     gradient[1] += 2.0 * sigma_n**2 * np.trace(g)
     g *= k
-    row_sum = g.sum(axis=1)
-    gradient[0] += 2.0 * row_sum.sum()
-    if latent is None:
-        return value
-    is_free = np.abs(u) < MAX_ABS_LOG_LENGTH_SCALE
-    g_u = np.where(is_free, row_sum - _curvature(g, r, length_scale), 0.0)
-    return value + latent.add_gradient(gradient, g_u, latent_terms)
+    gradient[0] += 2.0 * g.sum()
+    return value, g
 
 
-def _curvature(g: FloatArray, r: FloatArray, length_scale: FloatArray) -> FloatArray:
-    """Part of the derivative in u that depends on the distances; `g` is that in log k.
-
-    dk/du_i = k (1/2 - l_i^2 / s (1 - 2 d^2 / s)), s = l_i^2 + l_j^2, in rows and columns.
-    """
-    square = length_scale**2
-    inverse_spread = 1.0 / (square[:, None] + square)
-    weighted = g * (1.0 - 2.0 * _square_distance(r, r) * inverse_spread) * inverse_spread
-    result: FloatArray = 2.0 * square * weighted.sum(axis=1)
-    return result
-
-
-def _square_distance(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Squares of the distances between places, (A, B) [m^2]."""
-    result: FloatArray = (a[:, None] - b) ** 2
-    return result
-
-
-class _Latent(NamedTuple):
+class Latent(NamedTuple):
     """Latent process of a segment with p pseudo-inputs at the ranges of its n inliers."""
 
     u: FloatArray  # (n,) log length-scale
-    sigma_l_bar: float
-    sigma_n_bar: float
-    kind: IntArray  # (p,) entry of L-bar of each pseudo-input
+    r_bar: FloatArray  # (p,) ranges of the pseudo-inputs [m]
+    kind: IntArray  # (p,) entry of L-bar of each
     k_bar: FloatArray  # (p, p) without noise
     k_star: FloatArray  # (n, p)
-    distance2: FloatArray  # (p, p)
-    star_distance2: FloatArray  # (n, p)
-    factor: FloatArray  # (p, p) Cholesky factor of B
     inverse: FloatArray  # (p, p) of B
+    log_root: float  # half the logarithm of its determinant
     beta: FloatArray  # (p,)
 
-    @classmethod
-    def of(cls, theta: FloatArray, inliers: Inliers, m: int, r: FloatArray) -> _Latent:
-        sigma_f_bar, sigma_l_bar, sigma_n_bar = np.exp(theta[2:5])
-        bar = slice(inliers.bar_offsets[m], inliers.bar_offsets[m + 1])
-        r_bar, kind = inliers.r_bar[bar], inliers.kind[bar]
-        l_bar = inliers.log_extent[bar] + theta[5 + kind]
-        kernel = sigma_f_bar**2, 0.5 / sigma_l_bar**2
-        k_bar = squared_exponential(r_bar[:, None], r_bar, *kernel)
-        k_star = squared_exponential(r[:, None], r_bar, *kernel)
-        b = k_bar + sigma_n_bar**2 * np.eye(len(r_bar))
-        inverse = np.linalg.inv(b)
-        beta = inverse @ (l_bar - l_bar.mean())
-        u = l_bar.mean() + k_star @ beta
-        return cls(
-            u=np.clip(u, -MAX_ABS_LOG_LENGTH_SCALE, MAX_ABS_LOG_LENGTH_SCALE),
-            sigma_l_bar=sigma_l_bar,
-            sigma_n_bar=sigma_n_bar,
-            kind=kind,
-            k_bar=k_bar,
-            k_star=k_star,
-            distance2=_square_distance(r_bar, r_bar),
-            star_distance2=_square_distance(r, r_bar),
-            factor=np.linalg.cholesky(b),
-            inverse=inverse,
-            beta=beta,
-        )
 
-    def add_gradient(self, gradient: FloatArray, g_u: FloatArray, latent_terms: bool) -> float:
-        """Propagate the derivatives in u to theta; return the latent terms of the value."""
-        beta, weight = self.beta, self.inverse @ (g_u @ self.k_star)
-        # u is the mean of L-bar and what the process makes of the differences from it.
-        g_l_bar = weight + (g_u.sum() - weight.sum()) / len(beta)
-        gradient[5:] += np.bincount(self.kind, g_l_bar, minlength=len(gradient) - 5)
+def predict(
+    theta: FloatArray, r_bar: FloatArray, log_extent: FloatArray, kind: IntArray, r: FloatArray
+) -> Latent:
+    """Latent process with these pseudo-inputs (p,), at ranges `r` (n,)."""
+    kernel = np.exp(2.0 * theta[2]), 0.5 * np.exp(-2.0 * theta[3])
+    l_bar = log_extent + theta[5 + kind]
+    k_bar = squared_exponential(r_bar[:, None], r_bar, *kernel)
+    k_star = squared_exponential(r[:, None], r_bar, *kernel)
+    inverse, log_root = inverted(k_bar + np.exp(2.0 * theta[4]) * np.eye(len(r_bar)))
+    beta = inverse @ (l_bar - l_bar.mean())
+    u, bound = l_bar.mean() + k_star @ beta, MAX_ABS_LOG_LENGTH_SCALE
+    return Latent(np.clip(u, -bound, bound), r_bar, kind, k_bar, k_star, inverse, log_root, beta)
 
-        # Adjoints of k_star and of B: every derivative is contracted with them.
-        star = g_u[:, None] * self.k_star * beta
-        adjoint = -np.outer(weight, beta)
-        if latent_terms:
-            adjoint -= 0.5 * self.inverse
-        gradient[4] += 2.0 * self.sigma_n_bar**2 * np.trace(adjoint)
-        adjoint *= self.k_bar
-        gradient[2] += 2.0 * (star.sum() + adjoint.sum())
-        contracted = np.sum(star * self.star_distance2) + np.sum(adjoint * self.distance2)
-        gradient[3] += contracted / self.sigma_l_bar**2
-        if not latent_terms:
-            return 0.0
-        return -float(np.log(np.diagonal(self.factor)).sum() + 0.5 * len(beta) * _LOG_2PI)
+
+def add_latent(
+    theta: FloatArray,
+    gradient: FloatArray,
+    latent: Latent,
+    r: FloatArray,
+    g: FloatArray,
+    latent_terms: bool,
+) -> float:
+    """Propagate the derivatives in log k, `g` (n, n), to theta; return the latent terms.
+
+    dk/du_i = k (1/2 - l_i^2 / s (1 - 2 d^2 / s)), s = l_i^2 + l_j^2, in rows and columns.
+    """
+    square, beta, r_bar = np.exp(2.0 * latent.u), latent.beta, latent.r_bar
+    spread, distance = square[:, None] + square, r[:, None] - r
+    along = 1.0 - 2.0 * square[:, None] / spread * (1.0 - 2.0 * distance**2 / spread)
+    is_free = np.abs(latent.u) < MAX_ABS_LOG_LENGTH_SCALE
+    g_u = is_free * (g * along).sum(axis=1)
+    # u is the mean of L-bar and what the process makes of the differences from it.
+    weight = latent.inverse @ (g_u @ latent.k_star)
+    g_l_bar = weight + (g_u.sum() - weight.sum()) / len(beta)
+    gradient[5:] += np.bincount(latent.kind, g_l_bar, len(gradient) - 5)
+    # Adjoints of k_star and of B: every derivative is contracted with them.
+    star, adjoint = g_u[:, None] * latent.k_star * beta, -np.outer(weight, beta)
+    if latent_terms:
+        adjoint -= 0.5 * latent.inverse
+    gradient[4] += 2.0 * np.exp(2.0 * theta[4]) * np.trace(adjoint)
+    adjoint *= latent.k_bar
+    gradient[2] += 2.0 * (star.sum() + adjoint.sum())
+    contracted = (star * (r[:, None] - r_bar) ** 2).sum()
+    contracted += (adjoint * (r_bar[:, None] - r_bar) ** 2).sum()
+    gradient[3] += contracted * np.exp(-2.0 * theta[3])
+    return -(latent.log_root + 0.5 * len(beta) * LOG_2PI) if latent_terms else 0.0
