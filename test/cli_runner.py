@@ -17,6 +17,8 @@ code made from a string ran, as of `namedtuple` and `dataclass`, although it was
 
 PATIENCE = 120.0
 """Time to wait for what has to happen [s]; only a failure takes that long."""
+LOOK_PERIOD = 0.005
+"""Time between two looks whether it has [s]."""
 
 
 def wait_for(condition, what):
@@ -24,7 +26,7 @@ def wait_for(condition, what):
     end = time.monotonic() + PATIENCE
     while not condition():
         assert time.monotonic() <= end, f'after {PATIENCE:g} s still no {what}'
-        time.sleep(0.005)
+        time.sleep(LOOK_PERIOD)
 
 
 def run(*words):
@@ -58,6 +60,12 @@ def until_ctrl_c(*words, **options):
 def stat_words(pid):
     """Words about a process, from its state on; see proc(5)."""
     return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+
+
+def cpu_seconds(pid):
+    """Time for which a process has run, also if it has ended and nobody knows it yet."""
+    words = stat_words(pid)
+    return (int(words[11]) + int(words[12])) / os.sysconf('SC_CLK_TCK')
 
 
 def parent_of(pid):

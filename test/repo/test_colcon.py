@@ -89,8 +89,7 @@ def test_the_installed_node_runs_as_ros2_run_starts_it(workspace, tmp_path):
         node.wait_until_ready()
         assert f'listening to {NAMESPACE}/points' in node.log
         assert 'grid.n_bins: 120  (default 80)' in node.log
-        code, _ = node.stop(signal.SIGINT)
-    assert code == 0, node.log
+        assert node.stop(signal.SIGINT) == 0, node.log
     assert 'Traceback' not in node.log
 
 

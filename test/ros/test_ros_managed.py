@@ -3,7 +3,7 @@
 import importlib.util
 import os
 import signal
-import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -24,6 +24,8 @@ HAS_NO_BOND = importlib.util.find_spec('bond') is None
 UNCONFIGURED, INACTIVE, ACTIVE, FINALIZED = 1, 2, 3, 4
 CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE, SHUTDOWN = 1, 2, 3, 4, 5
 """Numbers of `lifecycle_msgs`: states, and transitions; 5 to 7 end each of the first states."""
+AT_ONCE = 2.5
+"""Longest time to an answer [s]."""
 
 
 @pytest.fixture
@@ -43,6 +45,14 @@ def change(link, number=0, label=''):
     request = ChangeState.Request(transition=Transition(id=number, label=label))
     is_done = link.call(ChangeState, 'change_state', request).success
     return is_done, link.call(GetState, 'get_state', GetState.Request()).current_state.id
+
+
+def change_soon(process, link, number):
+    """As `change`, and the process is not busy with something else first."""
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(change, link, number)
+        assert process.time_of(answer.done, 'answer') < AT_ONCE, number
+    return answer.result()
 
 
 def test_the_transitions_compile_listen_and_free(managed):
@@ -77,10 +87,16 @@ def test_a_lifecycle_manager_hears_a_bond_while_the_node_is_active(managed):
     heard, instances = ros.Collector(link.probe, Status, 'bond'), set()
     change(link, CONFIGURE)
     assert not heard.messages
+
+    def is_regular():
+        times = [one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec for one in heard.messages]
+        return len(times) > 2 and np.median(np.diff(times)) == pytest.approx(0.1, abs=0.05)
+
     for n in (1, 2):
         heard.messages.clear()
         change(link, ACTIVATE)
-        wait_for(lambda: len(heard.messages) > 2, 'three heartbeats')
+        # Nav2's manager waits half of its bond_timeout for the first that it hears.
+        wait_for(is_regular, 'heartbeat every 0.1 s')
         change(link, DEACTIVATE)
         wait_for(lambda: not heard.messages[-1].active, 'end of the bond')
         *beats, end = heard.messages
@@ -88,9 +104,6 @@ def test_a_lifecycle_manager_hears_a_bond_while_the_node_is_active(managed):
         assert {one.id for one in heard.messages} == {NODE_NAME}
         instances |= {one.instance_id for one in heard.messages}
         assert len(instances) == n
-        times = [one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec for one in beats]
-        # Nav2's manager waits half of its bond_timeout for the first that it hears.
-        assert np.median(np.diff(times)) == pytest.approx(0.1, abs=0.05)
         assert end.heartbeat_period == pytest.approx(0.1) and end.heartbeat_timeout == 4.0
     assert 'bond_timeout' not in process.log
 
@@ -104,9 +117,7 @@ def test_impossible_transitions_are_refused_at_once(managed):
     }  # fmt: skip
     for state, numbers in possible.items():
         for number in {*range(12), *range(60, 70), 99, 255}.difference(numbers):
-            start = time.monotonic()
-            assert change(link, number) == (False, state), (state, number)
-            assert time.monotonic() - start < 5.0
+            assert change_soon(process, link, number) == (False, state), (state, number)
         for label in ('create', 'activate', 'nonsense\n'):
             assert (state, label) == (INACTIVE, 'activate') or not change(link, label=label)[0]
         if state == ACTIVE:
@@ -127,9 +138,8 @@ def test_a_node_that_compiles_answers_and_ends_at_a_signal(tmp_path, monkeypatch
     cache.mkdir(mode=0o700)
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(cache))
     process, link = request.getfixturevalue('managed')
-    start = time.monotonic()
-    assert change(link, CONFIGURE) == (True, INACTIVE) and change(link, ACTIVATE) == (True, ACTIVE)
-    assert time.monotonic() - start < 5.0
+    for number, state in (CONFIGURE, INACTIVE), (ACTIVATE, ACTIVE):
+        assert change_soon(process, link, number) == (True, state)
     wait_for(lambda: children(process.popen.pid), 'compiler')
     link.wait_until_connected()
     assert sum(cloud.width for cloud in link.segment(to_message(street(3000)))) == 3000

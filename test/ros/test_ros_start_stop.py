@@ -11,7 +11,7 @@ import pytest
 import rclpy
 import ros_helpers as ros
 from bag_samples import write_ros2_bag
-from cli_runner import children, is_running, stat_words
+from cli_runner import children, cpu_seconds, is_running
 from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 
 from gp_ground_seg.core.jit import HAVE_NUMBA
@@ -263,11 +263,6 @@ def test_unused_files_are_warned_of_with_their_keys(tmp_path):
 # Signals to the node: it ends with code 0, after the cloud at hand.
 
 
-def cpu_seconds(pid):
-    words = stat_words(pid)
-    return (int(words[11]) + int(words[12])) / os.sysconf('SC_CLK_TCK')
-
-
 def heeds_sigterm(process):
     """Whether the process has a handler of its own."""
     with open(f'/proc/{process.popen.pid}/status', encoding='ascii') as status:
@@ -344,7 +339,7 @@ def test_sigint_that_was_ignored_at_the_start_ends_the_player_and_the_node(tmp_p
     with Process(folder=tmp_path, command=node) as node, ros.linked(sends=None) as link:
         with Process(folder=tmp_path, command=player) as player:
             link.ground.wait(4)
-            assert player.stop(signal.SIGINT)[0] == 130
+            assert player.stop(signal.SIGINT) == 130
             assert player.log.splitlines()[-1] == 'gp-ground-seg: interrupted'
         node.end_well(signal.SIGINT)
 
