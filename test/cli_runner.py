@@ -62,10 +62,10 @@ def stat_words(pid):
     return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
 
 
-def cpu_seconds(pid):
-    """Time for which a process has run, also if it has ended and nobody knows it yet."""
-    words = stat_words(pid)
-    return (int(words[11]) + int(words[12])) / os.sysconf('SC_CLK_TCK')
+def cpu_seconds(pid, with_children=False):
+    """CPU time of a process, and of those of its children that have ended."""
+    times = stat_words(pid)[11 : 15 if with_children else 13]
+    return sum(map(int, times)) / os.sysconf('SC_CLK_TCK')
 
 
 def parent_of(pid):

@@ -36,23 +36,19 @@ def managed(tmp_path):
         process,
         link,
     ):
+        link.process = process
         yield process, link
         process.end_well()
 
 
 def change(link, number=0, label=''):
-    """Whether the node has made the transition, and its state after it."""
+    """Whether the node has made the transition, at once, and its state after it."""
     request = ChangeState.Request(transition=Transition(id=number, label=label))
-    is_done = link.call(ChangeState, 'change_state', request).success
-    return is_done, link.call(GetState, 'get_state', GetState.Request()).current_state.id
-
-
-def change_soon(process, link, number):
-    """As `change`, and the process is not busy with something else first."""
     with ThreadPoolExecutor(1) as pool:
-        answer = pool.submit(change, link, number)
-        assert process.time_of(answer.done, 'answer') < AT_ONCE, number
-    return answer.result()
+        answer = pool.submit(link.call, ChangeState, 'change_state', request)
+        state = pool.submit(link.call, GetState, 'get_state', GetState.Request())
+        assert link.process.time_of(state.done, 'state') < AT_ONCE
+    return answer.result().success, state.result().current_state.id
 
 
 def test_the_transitions_compile_listen_and_free(managed):
@@ -117,7 +113,7 @@ def test_impossible_transitions_are_refused_at_once(managed):
     }  # fmt: skip
     for state, numbers in possible.items():
         for number in {*range(12), *range(60, 70), 99, 255}.difference(numbers):
-            assert change_soon(process, link, number) == (False, state), (state, number)
+            assert change(link, number) == (False, state), (state, number)
         for label in ('create', 'activate', 'nonsense\n'):
             assert (state, label) == (INACTIVE, 'activate') or not change(link, label=label)[0]
         if state == ACTIVE:
@@ -138,8 +134,7 @@ def test_a_node_that_compiles_answers_and_ends_at_a_signal(tmp_path, monkeypatch
     cache.mkdir(mode=0o700)
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(cache))
     process, link = request.getfixturevalue('managed')
-    for number, state in (CONFIGURE, INACTIVE), (ACTIVATE, ACTIVE):
-        assert change_soon(process, link, number) == (True, state)
+    assert change(link, CONFIGURE) == (True, INACTIVE) and change(link, ACTIVATE) == (True, ACTIVE)
     wait_for(lambda: children(process.popen.pid), 'compiler')
     link.wait_until_connected()
     assert sum(cloud.width for cloud in link.segment(to_message(street(3000)))) == 3000

@@ -19,18 +19,8 @@ from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.core.pipeline.sensor_pose import LITTLE_GROUND, NO_HEIGHT
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 from gp_ground_seg.ros import diagnostics
-from gp_ground_seg.ros.input import THROTTLED
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
-
-
-@pytest.fixture(scope='module', autouse=True)
-def slow_log():
-    """What is throttled is not said twice in a test, however long that takes."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(THROTTLED, 'throttle_duration_sec', 600.0)
-        yield
-
 
 OVERRIDES = f'qos_overrides.{NAMESPACE}/points.subscription'
 
@@ -170,7 +160,7 @@ def test_packets_have_the_height_of_the_last_cloud_until_that_is_forgotten(b, tm
     points, packets = turn_of_packets()
     packet, kept = max(packets, key=len), 'of an earlier one is kept'
 
-    def ground_of(cloud, frame='lidar', second=100):
+    def ground_of(cloud, frame='spinning', second=100):
         """Numbers of the points of the ground, which are their intensity."""
         ground, _ = b.segment(to_message(cloud, (second, 0), frame))
         return {row[:4] for row in ros.rows_of(ground)}
@@ -211,7 +201,6 @@ def test_packets_have_the_height_of_the_last_cloud_until_that_is_forgotten(b, tm
 
 
 def test_bad_clouds_among_good_ones_are_refused_with_one_message(b, tmp_path):
-    b.node.get_logger().contexts.clear()  # as at the start
     with ros.stderr_in(tmp_path) as said:
         good = to_message(street(500), frame='lidar')
         bad = [to_message(street(500), frame='broken') for _ in range(3)]

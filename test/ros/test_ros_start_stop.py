@@ -12,7 +12,8 @@ import rclpy
 import ros_helpers as ros
 from bag_samples import write_ros2_bag
 from cli_runner import children, cpu_seconds, is_running
-from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
+from conftest import run_python
+from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, PATIENCE, Process, wait_for
 
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.schema import read_yaml, sections_of
@@ -113,14 +114,6 @@ def test_words_that_nobody_takes_are_refused(capsys, words):
     assert 'nonsense' in capsys.readouterr().err
 
 
-def errors_of(code, *words):
-    """The lines on standard error of a Python process that runs a code and says nothing else."""
-    command = [sys.executable, '-c', code, *words]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout) == (0, ''), done.stderr
-    return done.stderr.splitlines()
-
-
 NO_FOLDER = """
 import os
 import gp_ground_seg.ros.node  # once for all
@@ -136,9 +129,9 @@ for given in ({}, {'HOME': '/proc'}, {'ROS_LOG_DIR': '/proc'}):
 
 
 def test_logs_that_have_no_folder():
-    lines = errors_of(NO_FOLDER)
+    out, errors = run_python(NO_FOLDER)
     said = ': set ROS_LOG_DIR to a folder that the node may write to'
-    assert [line.endswith(said) for line in lines] == 3 * [True]
+    assert [line.endswith(said) for line in (out + errors).splitlines()] == 3 * [True]
 
 
 NO_ROS = """
@@ -152,8 +145,9 @@ for words in (['node'], ['play', sys.argv[1]], ['demo']):
 
 def test_missing_ros_is_said_in_one_line(tmp_path):
     write_ros2_bag(tmp_path / 'drive.mcap', 1)
-    lines = errors_of(NO_ROS, tmp_path / 'drive.mcap')
-    for command, line in zip(('the node', 'play', 'the demo'), lines, strict=True):
+    out, errors = run_python(NO_ROS, tmp_path / 'drive.mcap')
+    commands = 'the node', 'play', 'the demo'
+    for command, line in zip(commands, (out + errors).splitlines(), strict=True):
         assert f'{command} needs ROS 2, which cannot be imported' in line
         assert f'pip install {ROS_WHEELS}' in line
 
@@ -168,7 +162,7 @@ def test_missing_ros_is_said_in_one_line(tmp_path):
 )
 def test_middleware_of_another_installation_is_named(words, name):
     command, given = [sys.executable, *words], {**os.environ, 'RMW_IMPLEMENTATION': name}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=given)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=given)
     (line,) = done.stderr.splitlines()
     package = f'ros-jazzy-{name.replace("_", "-")}'
     assert done.returncode == 2 and line.endswith(f'stall {package}')
