@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from cli_runner import cpu_seconds
 
 from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.cli.demo import FRAME_ID
@@ -40,7 +39,9 @@ PERCENTILES = {50: 'p50 [ms]', 95: 'p95', 99: 'p99', 100: 'worst'}
 def dropped_by_node(session, arrays):
     """Clouds that the node has dropped, by its next report."""
     arrays.clear()
-    session.wait_for(lambda: arrays, 5.0)
+    end = time.monotonic() + 5.0
+    while not arrays and time.monotonic() < end:
+        session.spin(0.05)
     for status in (status for array in arrays for status in array.status):
         if status.name.endswith(': processing'):
             return int({e.key: e.value for e in status.values}['Dropped since startup'])
@@ -78,13 +79,11 @@ class Probe:
             self._publisher.publish(raw)
             on_sent()
             due += 1.0 / rate
-        n_back = 0
-
-        def is_more_back():
-            return self._n_back() > n_back
-
-        while n_back < len(self._sent) and self._session.wait_for(is_more_back, SILENCE):
-            n_back = self._n_back()
+        n_back, last_news = self._n_back(), time.monotonic()
+        while n_back < len(self._sent) and time.monotonic() < last_news + SILENCE:
+            self._session.spin(0.02)
+            if (n := self._n_back()) > n_back:
+                n_back, last_news = n, time.monotonic()
         return self._result(rate)
 
     def _result(self, asked):
@@ -109,6 +108,12 @@ def restamped(clouds, start):
     """Yield clouds over and over, stamped every 0.1 s from the second `start` on."""
     for k, cloud in enumerate(itertools.cycle(clouds)):
         yield with_stamp(cloud, (start + k // 10, k % 10 * 10**8))
+
+
+def cpu_of(pid):
+    """CPU time of a process and of those of its children that have ended [s]."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+    return sum(map(int, fields[11:15])) / os.sysconf('SC_CLK_TCK')
 
 
 @contextlib.contextmanager
@@ -137,10 +142,10 @@ def measure(clouds, ros_args):
             node.check()
         probe = Probe(session)
         for rate in RATES:
-            before, cpu = dropped_by_node(session, arrays), cpu_seconds(node.pid)
+            before, cpu = dropped_by_node(session, arrays), cpu_of(node.pid)
             with progress(f'{rate:g} Hz')(total=N_SENT) as bar:
                 found = probe.send(itertools.islice(stamped, N_SENT), rate, bar.update)
-            found['CPU [ms]'] = 1e3 * (cpu_seconds(node.pid) - cpu) / N_SENT
+            found['CPU [ms]'] = 1e3 * (cpu_of(node.pid) - cpu) / N_SENT
             n_dropped = dropped_by_node(session, arrays) - before
             results.append({**found, 'reported': n_dropped})
     return results
@@ -167,8 +172,10 @@ def first_minute(clouds, cores, is_busy, ros_args):
                     compiled.append(time.monotonic() - start)
 
             found = probe.send(itertools.islice(restamped(clouds, 1), N_SENT), 10.0, note)
-            cpu = cpu_seconds(node.pid, with_children=True)
-            session.wait_for(lambda: note() or compiled, start + 240.0 - time.monotonic())
+            cpu = cpu_of(node.pid)
+            while not compiled and time.monotonic() < start + 240.0:
+                session.sleep(0.2)
+                note()
         finally:
             for process in beside:
                 process.kill()

@@ -170,8 +170,7 @@ def rows_of(message):
 _RUN = "import sys; sys.path.remove(''); from gp_ground_seg.cli.node import {0}; sys.exit({0}())"
 ENTRY_POINT, MANAGED = (('-c', _RUN.format(name)) for name in ('main', 'main_managed'))
 """What the installed executables do; the first of sys.path is their folder."""
-SOON = 4.0
-"""Time of the cloud at hand at most, as `Process.time_of` has it [s]."""
+SOON = 4.0  # longest time of the cloud at hand, as `Process.time_of` has it [s]
 MODULE = ('-m', 'gp_ground_seg', 'node')
 IN_NAMESPACE = ('--ros-args', '-r', f'__ns:={NAMESPACE}')
 

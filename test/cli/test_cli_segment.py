@@ -214,11 +214,8 @@ def test_a_stopped_run_leaves_the_old_bag(tmp_path, capsys, how, code):
     words = [word for value in slow for word in ('--set', value)]
     process = start('segment', tmp_path / 'long', '-o', tmp_path / 'out', '--force', *words)
 
-    def has_written():
-        assert process.poll() is None, process.communicate()
-        return sum(p.stat().st_size for p in tmp_path.glob('.*.partial-*/**/*.mcap')) > 500_000
-
-    wait_for(has_written, 'output')
+    parts = '.*.partial-*/**/*.mcap'
+    wait_for(lambda: sum(p.stat().st_size for p in tmp_path.glob(parts)) > 500_000, 'output')
     process.send_signal(how)
     _, said = process.communicate(timeout=PATIENCE)
     assert process.returncode == code

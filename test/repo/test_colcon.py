@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import pytest
 pytest.importorskip('rclpy', reason='ROS is not installed')
 pytest.importorskip('colcon_core', reason='colcon is not installed')
 
-from conftest import REPOSITORY
+from conftest import REPOSITORY, run_shell
 from ros_helpers import NAMESPACE, Process
 
 pytestmark = pytest.mark.slow
@@ -35,11 +36,8 @@ def build(folder, *words):
         '--base-paths', REPOSITORY, '--packages-select', PACKAGE,
         '--install-base', folder / 'install', '--build-base', folder / 'build', *words,
     ]  # fmt: skip
-    built = subprocess.run(
-        command, cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=1800.0
-    )
-    assert built.returncode == 0, built.stdout + built.stderr
-    assert '1 package finished' in built.stdout
+    said = run_shell(shlex.join(map(str, command)), folder, ENVIRONMENT)
+    assert '1 package finished' in said
     return folder
 
 

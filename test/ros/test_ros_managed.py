@@ -24,8 +24,7 @@ HAS_NO_BOND = importlib.util.find_spec('bond') is None
 UNCONFIGURED, INACTIVE, ACTIVE, FINALIZED = 1, 2, 3, 4
 CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE, SHUTDOWN = 1, 2, 3, 4, 5
 """Numbers of `lifecycle_msgs`: states, and transitions; 5 to 7 end each of the first states."""
-AT_ONCE = 2.5
-"""Longest time to an answer [s]."""
+AT_ONCE = 2.5  # longest time to an answer [s]
 
 
 @pytest.fixture

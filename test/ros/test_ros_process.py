@@ -60,8 +60,7 @@ def sender(link):
 
 
 def test_clouds_of_two_megabytes_at_10_hz_all_come_back(sender):
-    message = to_message(street(30_000))
-    next_time = time.monotonic()
+    message, next_time = to_message(street(30_000)), time.monotonic()
     for k in range(20):
         message.header.stamp.sec = k
         sender.publisher.publish(message)

@@ -257,19 +257,31 @@ def test_unused_files_are_warned_of_with_their_keys(tmp_path):
 # Signals to the node: it ends with code 0, after the cloud at hand.
 
 
-def heeds_sigterm(process):
-    """Whether the process has a handler of its own."""
-    with open(f'/proc/{process.popen.pid}/status', encoding='ascii') as status:
-        caught = next(line for line in status if line.startswith('SigCgt:'))
-    return bool(int(caught.split()[1], 16) >> (signal.SIGTERM - 1) & 1)
+# The import of ROS removes the folder HOLD, and waits until that is there again.
+HOLD = """
+import os, sys, time
+class Importer:
+    def find_spec(self, name, *_):
+        if name == 'rclpy':
+            sys.meta_path.remove(self)
+            os.rmdir(os.environ['HOLD'])
+            while not os.path.exists(os.environ['HOLD']):
+                time.sleep(0.01)
+sys.meta_path.insert(0, Importer())
+"""
 
 
 @pytest.mark.parametrize(
     ('start', 'number'), [(ros.ENTRY_POINT, signal.SIGINT), (MODULE, signal.SIGTERM)]
 )
 def test_while_importing(tmp_path, start, number):
-    with Process(*FIXED, folder=tmp_path, start=start) as node:
-        wait_for(lambda: heeds_sigterm(node), 'handler')
+    (hold := tmp_path / 'hold').mkdir()
+    (tmp_path / 'sitecustomize.py').write_text(HOLD)
+    environment = {'HOLD': str(hold), 'PYTHONPATH': os.pathsep.join([str(tmp_path), *sys.path])}
+    with Process(*FIXED, folder=tmp_path, start=start, **environment) as node:
+        wait_for(lambda: not hold.exists(), 'import of ROS')
+        node.popen.send_signal(number)
+        hold.mkdir()
         node.end_well(number)
         assert 'listening' not in node.log
 
@@ -342,10 +354,11 @@ STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @pytest.fixture
-def handlers(heeded_hangup):
-    """The handlers in use, which are there again after the test."""
+def handlers():
+    """Handlers as in a terminal, also under nohup; those in use are there again after the test."""
     before = {number: signal.getsignal(number) for number in STOPS}
-    yield before
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield {**before, signal.SIGHUP: signal.SIG_DFL}
     for number, handler in before.items():
         signal.signal(number, handler)
 
