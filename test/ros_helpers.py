@@ -215,10 +215,7 @@ class Process:
             self.wait_until_ready(CHANGED)
 
     def time_of(self, condition, what):
-        """Wait until `condition` holds; return how long the process ran or slept meanwhile [s].
-
-        That is without what a machine that does other things adds.
-        """
+        """Time that the process runs or sleeps until `condition` holds, not that it is held up."""
         before, n_asleep = cpu_seconds(self.popen.pid), 0
 
         def holds():

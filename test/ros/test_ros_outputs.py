@@ -84,8 +84,6 @@ def test_a_reader_that_is_transient_local_gets_a_grid_of_the_last_second_only(b)
     ros.wait_for(lambda: b.node._outputs.n_subscribers()[readers[0].subscription.topic_name], 'it')
     time.sleep(0.3)
     assert not readers[0].messages
-    b.segment(message)
-    readers[0].wait(1)
 
     def comes_to_the_next():
         """Unless it is too old, where this process was kept from its work just then."""
@@ -95,6 +93,7 @@ def test_a_reader_that_is_transient_local_gets_a_grid_of_the_last_second_only(b)
         return readers[-1].messages
 
     ros.wait_for(comes_to_the_next, 'grid at once')
+    readers[0].wait(1)
     for reader in readers:
         b.forget(reader)
 
