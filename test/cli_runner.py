@@ -77,8 +77,7 @@ def is_running(pid, *parents):
 
 def children(pid):
     """Processes that a process has started and that have not ended."""
-    every = map(int, filter(str.isdigit, os.listdir('/proc')))
-    return [one for one in every if is_running(one, pid)]
+    return [n for n in map(int, filter(str.isdigit, os.listdir('/proc'))) if is_running(n, pid)]
 
 
 @contextlib.contextmanager

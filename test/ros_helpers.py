@@ -35,6 +35,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg.core.backend import choose_backend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
+from gp_ground_seg.ros import diagnostics
 from gp_ground_seg.ros.input import THROTTLED
 from gp_ground_seg.ros.loader import CHANGED, FOLLOWS
 from gp_ground_seg.ros.node import GroundSegmentationNode
@@ -49,7 +50,8 @@ ISOLATION = {
     'RCUTILS_COLORIZED_OUTPUT': '0',
 }
 os.environ.update(ISOLATION)
-THROTTLED['throttle_duration_sec'] = 600.0  # nothing twice in a test, however long that takes
+# Nothing is said twice in a test, however long that takes.
+THROTTLED['throttle_duration_sec'] = diagnostics.LOG_PERIOD = 600.0
 
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
