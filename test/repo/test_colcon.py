@@ -35,8 +35,7 @@ def build(folder, *words):
         '--base-paths', REPOSITORY, '--packages-select', PACKAGE,
         '--install-base', folder / 'install', '--build-base', folder / 'build', *words,
     ]  # fmt: skip
-    said = run_shell(shlex.join(map(str, command)), folder, ENVIRONMENT)
-    assert '1 package finished' in said
+    assert '1 package finished' in run_shell(shlex.join(map(str, command)), folder, ENVIRONMENT)
     return folder
 
 
