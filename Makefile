@@ -51,15 +51,17 @@ demo: $(VENV)/.ros
 # A test that hangs fails after so many seconds, with a traceback. Two processes share the modules,
 # in the order of test/conftest.py: one compiles, the other begins with what needs no compiled code.
 test: $(VENV)/.dev
-	$(WITH_KITTI) $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --timeout=300 -m 'not slow'
+	$(WITH_KITTI) $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --timeout=900 -m 'not slow'
 
 # The slow ones run one after the other: some measure time and memory.
 test-all: test
-	$(WITH_KITTI) $(BIN)/python -m pytest --timeout=1500 -m slow
+	$(WITH_KITTI) $(BIN)/python -m pytest --timeout=3600 -m slow
 
+# The network may fail now and then, and another program may hold the lock.
+chromium: APT := -o Acquire::Retries=5 -o DPkg::Lock::Timeout=300
 chromium:
 	@command -v chromedriver >/dev/null \
-		|| { [ "$$(id -u)" = 0 ] && apt-get update -qq && apt-get install -qq -y chromium-driver; } \
+		|| { [ "$$(id -u)" = 0 ] && apt-get $(APT) update -qq && apt-get $(APT) install -qq -y chromium-driver; } \
 		|| { echo 'Chromium is not installed: sudo apt-get install chromium-driver'; exit 1; }
 
 browser-test: $(VENV)/.dev chromium

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -15,8 +16,8 @@ INTERRUPTED = (130, -signal.SIGINT)
 code made from a string ran, as of `namedtuple` and `dataclass`, although it was caught."""
 
 
-PATIENCE = 120.0
-"""Time to wait for what has to happen [s]; only a failure takes that long."""
+PATIENCE = 120.0  # for what has to happen [s]; only a failure takes that long
+LOOK_PERIOD = 0.005  # time between two looks whether it has [s]
 
 
 def wait_for(condition, what):
@@ -24,7 +25,7 @@ def wait_for(condition, what):
     end = time.monotonic() + PATIENCE
     while not condition():
         assert time.monotonic() <= end, f'after {PATIENCE:g} s still no {what}'
-        time.sleep(0.005)
+        time.sleep(LOOK_PERIOD)
 
 
 def run(*words):
@@ -60,24 +61,34 @@ def stat_words(pid):
     return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
 
 
-def parent_of(pid):
-    """Parent of a process; None if it has ended, waited for by its parent or not."""
+def cpu_seconds(pid):
+    """CPU time of a process."""
+    return sum(map(int, stat_words(pid)[11:13])) / os.sysconf('SC_CLK_TCK')
+
+
+def is_running(pid, *parents):
+    """Whether a process has not ended, waited for or not, and has one of the parents, if given."""
     try:
         state, parent = stat_words(pid)[:2]
     except (FileNotFoundError, ProcessLookupError):
-        return None
-    return None if state == 'Z' else int(parent)
-
-
-def is_running(pid):
-    """Whether a process has not ended."""
-    return parent_of(pid) is not None
+        return False
+    return state != 'Z' and (not parents or int(parent) in parents)
 
 
 def children(pid):
     """Processes that a process has started and that have not ended."""
-    found = [int(name) for name in os.listdir('/proc') if name.isdigit()]
-    return [one for one in found if parent_of(one) == pid]
+    return [n for n in map(int, filter(str.isdigit, os.listdir('/proc'))) if is_running(n, pid)]
+
+
+@contextlib.contextmanager
+def limited(kind, size):
+    """What this process may take of a kind of resource, within the block."""
+    before = resource.getrlimit(kind)
+    resource.setrlimit(kind, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(kind, before)
 
 
 def error_line(capsys):

@@ -26,6 +26,8 @@ settings.load_profile('default')
 def pytest_configure(config):
     # Not in pyproject.toml: there it holds where plugins are imported too, as launch_testing is.
     config.addinivalue_line('filterwarnings', 'error')
+    # As in a terminal, also where a shell runs the tests in the background.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 # `make test` has two processes: one compiles first, and the other has work until that is done.
@@ -62,6 +64,16 @@ def run_python(script, *words, **environment):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout, done.stderr
+
+
+def run_shell(script, folder, environment):
+    """What a script of bash prints, which ends with code 0 and without a traceback."""
+    done = subprocess.run(
+        ['bash', '-e', '-c', script], cwd=folder, env=environment, check=False, timeout=3000,
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0 and 'Traceback' not in done.stdout, done.stdout
+    return done.stdout
 
 
 def find_kitti() -> Path | None:
@@ -150,19 +162,3 @@ def compiled_code():
 @pytest.fixture
 def scan() -> np.ndarray:
     return hilly_scan()
-
-
-@pytest.fixture(scope='session', autouse=True)
-def heeded_interrupt():
-    """SIGINT as in a terminal, also where a shell runs the tests in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.fixture
-def heeded_hangup():
-    """SIGHUP as in a terminal, also where the tests run under nohup."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGHUP, before)

@@ -23,7 +23,7 @@ with warnings.catch_warnings():
     import rosidl_generator_py  # noqa: F401
 
 import rclpy
-from cli_runner import PATIENCE, wait_for
+from cli_runner import LOOK_PERIOD, PATIENCE, cpu_seconds, stat_words, wait_for
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.context import Context
@@ -35,6 +35,8 @@ from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg.core.backend import choose_backend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
+from gp_ground_seg.ros import diagnostics
+from gp_ground_seg.ros.input import THROTTLED
 from gp_ground_seg.ros.loader import CHANGED, FOLLOWS
 from gp_ground_seg.ros.node import GroundSegmentationNode
 
@@ -48,6 +50,8 @@ ISOLATION = {
     'RCUTILS_COLORIZED_OUTPUT': '0',
 }
 os.environ.update(ISOLATION)
+# Nothing is said twice in a test, however long that takes.
+THROTTLED['throttle_duration_sec'] = diagnostics.LOG_PERIOD = 600.0
 
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -168,15 +172,20 @@ def rows_of(message):
 _RUN = "import sys; sys.path.remove(''); from gp_ground_seg.cli.node import {0}; sys.exit({0}())"
 ENTRY_POINT, MANAGED = (('-c', _RUN.format(name)) for name in ('main', 'main_managed'))
 """What the installed executables do; the first of sys.path is their folder."""
-SOON = 4.0
-"""Time of the cloud at hand, and what a machine that does other things adds to it [s]."""
+SOON = 4.0  # longest time of the cloud at hand, as `Process.time_of` has it [s]
 MODULE = ('-m', 'gp_ground_seg', 'node')
 IN_NAMESPACE = ('--ros-args', '-r', f'__ns:={NAMESPACE}')
 
 
+PATIENT = {
+    'diagnostics.period': 0.1, 'diagnostics.stale_after': 600.0, 'diagnostics.max_latency': 10.0,
+}  # fmt: skip
+"""Diagnostics come often, and a busy machine does not look like a fault."""
+
+
 def given(values):
-    """Words that give parameters their values; diagnostics come often unless they say else."""
-    values = {'diagnostics.period': 0.1, **values}
+    """Words that give parameters these values, and those of `PATIENT` that are not among them."""
+    values = {**PATIENT, **values}
     return [word for k, v in values.items() for word in ('-p', f'{k}:={str(v).lower()}')]
 
 
@@ -207,17 +216,28 @@ class Process:
         if FOLLOWS in self.log:
             self.wait_until_ready(CHANGED)
 
+    def time_of(self, condition, what):
+        """Time that the process runs or sleeps until `condition` holds, not that it is held up."""
+        before, n_asleep = cpu_seconds(self.popen.pid), 0
+
+        def holds():
+            nonlocal n_asleep
+            n_asleep += stat_words(self.popen.pid)[0] == 'S'
+            return condition()
+
+        wait_for(holds, what)
+        return cpu_seconds(self.popen.pid) - before + n_asleep * LOOK_PERIOD
+
     def stop(self, number):
-        """Send a signal; return exit code and seconds until the end."""
-        start = time.monotonic()
+        """Send a signal; return the exit code."""
         self.popen.send_signal(number)
-        code = self.popen.wait(PATIENCE)
-        return code, time.monotonic() - start
+        return self.popen.wait(PATIENCE)
 
     def end_well(self, number=signal.SIGINT):
         """Send a signal, at which a node ends soon, with the cloud at hand, and says nothing."""
-        code, seconds = self.stop(number)
-        assert code == 0 and seconds < SOON, self.log
+        self.popen.send_signal(number)
+        seconds = self.time_of(lambda: stat_words(self.popen.pid)[0] == 'Z', 'end')
+        assert self.popen.wait() == 0 and seconds < SOON, self.log
         assert 'Traceback' not in self.log and 'ERROR' not in self.log
 
     def __enter__(self):

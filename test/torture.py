@@ -160,7 +160,7 @@ def damaged_message(rng):
 
 
 @pytest.fixture(scope='module')
-def node_and_link(tmp_path_factory):
+def node_and_link(tmp_path_factory, compiled_code):
     """A node in a process of its own, what talks to it, and a publisher of times."""
     with linked_process(tmp_path_factory.mktemp('node'), {'use_sim_time': True}) as (node, link):
         node.wait_until_settled()

@@ -25,9 +25,11 @@ from gp_ground_seg.ros import session
 
 
 @pytest.fixture(autouse=True)
-def stock_transport(monkeypatch):
-    """Fast DDS would keep a profile for all that follows in this process."""
+def patient_play(monkeypatch):
+    """With stock transport: Fast DDS would keep a profile for all that follows here."""
     monkeypatch.setattr(session, '_free_shared_memory', lambda: 0)
+    for name in ('DISCOVERY_TIMEOUT', 'DELIVERY_TIMEOUT'):
+        monkeypatch.setattr(bags, name, PATIENCE)
 
 
 @contextlib.contextmanager
@@ -82,9 +84,8 @@ def test_every_byte_of_every_topic_at_the_recorded_times(tmp_path):
         # None before its time, counted from the first, which a busy machine sends late.
         times = np.array(listener.times[topic])
         assert (times[1:] - times[0] > np.arange(7) * PERIOD / 2).all()
-    # The time of the bag, also between clouds.
     clock = listener.clock()
-    assert clock == sorted(clock) and clock[0] >= START and len({*clock}) > 8
+    assert clock == sorted(clock) and clock[0] >= START
 
 
 def test_loop_until_interrupted(tmp_path):
@@ -92,10 +93,11 @@ def test_loop_until_interrupted(tmp_path):
     with listening('/points') as listener:
         with until_ctrl_c(*words):
             wait_for_clouds(listener.clouds['/points'], 7)
+            wait_for(lambda: any((t - START) % PERIOD for t in listener.clock()), 'time between')
         wait_for(lambda: listener.n_publishers() == 0, 'farewell')
     stamps = [stamp_of(decode_cloud(raw)) for raw in listener.clouds['/points']]
     assert stamps == list(itertools.islice(itertools.cycle(stamps[:3]), len(stamps)))
-    # In each round the clock of the bag begins again.
+    # It is the time of the bag, also between clouds, and in each round begins again.
     assert (np.diff(listener.clock()) < 0).sum() >= 2
     # A period between the last of a round and the first of the next, as between the others.
     assert np.median(np.diff(listener.times['/points'])) > 0.5 * PERIOD / 2
@@ -114,16 +116,20 @@ rclpy.spin(node)
 
 def test_it_ends_without_a_subscriber_and_with_one_that_is_killed(tmp_path, monkeypatch):
     """It cannot say goodbye: the middleware waits for its acknowledgements."""
-    monkeypatch.setattr(bags, 'DELIVERY_TIMEOUT', 0.5)
-    monkeypatch.setattr(bags, 'DISCOVERY_TIMEOUT', 0.1)
-    bag = drive(tmp_path, 5)
+    bag, deliver = drive(tmp_path, 5), session.Session.wait_until_delivered
     with isolated_context():
-        assert play(bag, '--quiet') == 0
-        monkeypatch.setattr(bags, 'DISCOVERY_TIMEOUT', PATIENCE)
+        with monkeypatch.context() as patch:
+            patch.setattr(bags, 'DISCOVERY_TIMEOUT', 0.1)
+            assert play(bag, '--quiet') == 0
         command, environment = [sys.executable, '-c', SUBSCRIBER], {**os.environ, **ros.ISOLATION}
         with subprocess.Popen(command, env=environment) as subscriber:
+
+            def deliver_to_the_dead(*words):
+                assert subscriber.wait(PATIENCE) == -signal.SIGKILL
+                return deliver(*words[:2], 0.5)
+
+            monkeypatch.setattr(session.Session, 'wait_until_delivered', deliver_to_the_dead)
             assert play(bag, '--quiet') == 0
-            assert subscriber.wait(PATIENCE) == -signal.SIGKILL
 
 
 def test_words_that_ros_refuses(tmp_path, capsys):

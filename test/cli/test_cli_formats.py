@@ -88,10 +88,6 @@ FOLDERS = {
         ['s2_f1.bin', 's10_f2.bin', 's2_f10.bin', 's2_f2.bin'],
         ['s2_f1', 's2_f2', 's2_f10', 's10_f2'],
     ),
-    'frames': (
-        ['frame1.npy', 'frame10.npy', 'frame11.npy', 'frame2.npy'],
-        ['frame1', 'frame2', 'frame10', 'frame11'],
-    ),
     'zeros before': (['10.npy', '2.npy', '0001.npy'], ['0001', '2', '10']),
     'names before numbers': (['b_1.npy', 'a_2.npy', '1.npy'], ['1', 'a_2', 'b_1']),
     'letters first': (['1b.ply', 'a1.ply', '1a.ply'], ['1a', '1b', 'a1']),

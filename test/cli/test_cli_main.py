@@ -7,7 +7,6 @@ import re
 import shlex
 import struct
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -267,10 +266,11 @@ def test_progress_is_on_standard_error_and_rare_without_a_terminal(
     stderr = io.StringIO()
     stderr.isatty = lambda: is_terminal
     monkeypatch.setattr('sys.stderr', stderr)
-    monkeypatch.setattr(options, 'LINE_PERIOD', 0.2)
+    now = [0.0]
+    monkeypatch.setattr('tqdm.std.time', lambda: now[0])
     with options.progress('segment', quiet=quiet)(total=4) as bar:
         for _ in range(4):
-            time.sleep(0.11)
+            now[0] += 0.55 * options.LINE_PERIOD
             bar.update()
     said = stderr.getvalue()
     assert least <= said.count('segment |') == said.count('of 4 frames done') <= most

@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 import pytest
 from bag_samples import scan
-from cli_runner import start
+from cli_runner import PATIENCE, start
 
 from gp_ground_seg import Config
 from gp_ground_seg.cli import options
@@ -241,7 +241,7 @@ def test_few_scans_do_not_wait_for_the_compiler(tmp_path):
     scan(1).tofile(tmp_path / 'a.bin')
     env = os.environ | {'NUMBA_CACHE_DIR': str(tmp_path / 'none'), 'NUMBA_DISABLE_JIT': '0'}
     with start('segment', 'a.bin', '-o', 'a.label', cwd=tmp_path, env=env) as process:
-        said = process.communicate(timeout=60)[1]
+        said = process.communicate(timeout=PATIENCE)[1]
     assert process.returncode == 0, said
     assert said.count('segmented with numpy; to have compiled code, run') == 1
     assert 'compiling' not in said

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_samples import scan, write_ros1_bag, write_ros2_bag
-from cli_runner import error_line, run
+from cli_runner import error_line, limited, run
 from evaluation_samples import write_frame
 from foreign_files import CASES, XYZ
 from hypothesis import given, settings
@@ -162,12 +162,8 @@ def test_too_little_memory_is_one_line(tmp_path, capsys):
     """The largest scan that is taken, and less memory than that takes."""
     (tmp_path / 'a.bin').touch()
     os.truncate(tmp_path / 'a.bin', 1 << 30)
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (resident('VmSize') + (1 << 29), before[1]))
-    try:
+    with limited(resource.RLIMIT_AS, resident('VmSize') + (1 << 29)):
         assert run('segment', tmp_path / 'a.bin', '-o', tmp_path / 'a.label') == 2
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
     assert error_line(capsys) == 'not enough memory for this input'
 
 

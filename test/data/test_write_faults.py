@@ -11,12 +11,12 @@ import json
 import os
 import re
 import resource
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 from bag_samples import read_messages, scan, write_ros2_bag
-from cli_runner import run
+from cli_runner import limited, run
 from evaluation_samples import write_streets
 
 from gp_ground_seg import Config
@@ -54,16 +54,6 @@ def failing_call(folder, fails_at=-1):
         for name in ('open', 'mkdir', 'rename', 'replace', 'fsync'):
             patch.setattr(os, name, wrapped(name, getattr(os, name)))
         yield calls
-
-
-@contextlib.contextmanager
-def files_of_at_most(size):
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def content(folder):
@@ -139,7 +129,8 @@ def test_each_call_that_writes_fails_in_turn(name, tmp_path, capsys):
     expected = content(whole)
     size = max(path.stat().st_size for path in whole.rglob('*'))
     faults = [(call, failing_call, k) for k, call in enumerate(calls)]
-    faults += [('write', files_of_at_most, size * k // 4) for k in range(4)]
+    small = partial(limited, resource.RLIMIT_FSIZE)
+    faults += [('write', small, size * k // 4) for k in range(4)]
     for n, (call, fault, k) in enumerate(faults):
         folder, where = tmp_path / f'{n}', f'{call} {k}'
         folder.mkdir()

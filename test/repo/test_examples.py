@@ -68,7 +68,7 @@ def test_a_subscriber_hears_the_nearest_obstacle(tmp_path):
         publisher.publish(ros.to_message(points))
         ros.wait_for(lambda: 'away' in example.log, 'line on an obstacle')
         assert '3.00 m away, 90 degrees to the left' in example.log
-        assert example.stop(signal.SIGINT)[0] == 0
+        assert example.stop(signal.SIGINT) == 0
 
 
 def test_parameters_by_whatever_names_them(tmp_path):

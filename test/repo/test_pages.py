@@ -3,13 +3,12 @@
 import os
 import re
 import shlex
-import subprocess
 import sys
 
 import pytest
 import yaml
 from cli_runner import run
-from conftest import REPOSITORY, find_kitti, load_script
+from conftest import REPOSITORY, find_kitti, load_script, run_shell
 from evaluation_samples import write_streets
 
 from gp_ground_seg import __version__
@@ -187,12 +186,8 @@ def test_commands_of_the_tutorial_run_as_they_stand(block, tmp_path):
     program = tmp_path / 'gp-ground-seg'
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m gp_ground_seg "$@"\n')
     program.chmod(0o755)
-    done = subprocess.run(
-        ['bash', '-e', '-c', f'{block}\nwait\n'], cwd=tmp_path, check=False, timeout=300,
-        env={**os.environ, **isolation, 'PATH': f'{tmp_path}:{os.environ["PATH"]}'}, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-    )  # fmt: skip
-    assert done.returncode == 0 and 'Traceback' not in done.stdout, done.stdout
+    environment = {**os.environ, **isolation, 'PATH': f'{tmp_path}:{os.environ["PATH"]}'}
+    run_shell(f'{block}\nwait\n', tmp_path, environment)
 
 
 def test_each_table_has_its_sample_and_no_other_is_kept():

@@ -2,11 +2,10 @@
 
 import os
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
-from conftest import REPOSITORY, hilly_scan
+from conftest import REPOSITORY, hilly_scan, run_shell
 
 pytestmark = pytest.mark.slow
 
@@ -23,19 +22,7 @@ def try_it(language: str) -> list[str]:
 def run(script: str, folder: Path) -> str:
     own = {k: v for k, v in os.environ.items() if not k.startswith(NOT_OF_A_NEWCOMER)}
     # All tests would take minutes, and run in the checkout.
-    try:
-        done = subprocess.run(
-            ['bash', '-e', '-c', script], cwd=folder, stdin=subprocess.DEVNULL,
-            env={**own, 'PYTEST_ADDOPTS': 'test/data test/repo'},
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=1200,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired as late:
-        pytest.fail(
-            f'{script}\nhas not ended in {late.timeout:.0f} s, and printed:\n{late.output}'
-        )
-    assert done.returncode == 0, done.stdout
-    assert 'Traceback' not in done.stdout, done.stdout
-    return done.stdout
+    return run_shell(script, folder, {**own, 'PYTEST_ADDOPTS': 'test/data test/repo'})
 
 
 def test_the_commands_of_readme_work_one_after_the_other(tmp_path):

@@ -1,6 +1,5 @@
 """A node whose compiled code is not there yet: on numpy at first, compiled code in the end."""
 
-import signal
 import threading
 
 import pytest
@@ -37,7 +36,7 @@ def test_node_segments_while_its_code_is_compiled_and_then_changes_over(monkeypa
         link.segment(message)
         assert node.log.count(FOLLOWS) == node.log.count(CHANGED) == 1
         assert STAYS not in node.log
-        assert node.stop(signal.SIGINT)[0] == 0
+        node.end_well()
     # All of it is there for the next start.
     with ros.Process(*ros.IN_NAMESPACE, *ros.given(FIXED), folder=tmp_path) as node:
         node.wait_until_settled()

@@ -260,8 +260,7 @@ def bench_with_imu():
             message.header.stamp.sec, message.header.stamp.nanosec = stamp
             message.header.frame_id = frame
             message.orientation_covariance[0] = covariance
-            publisher.publish(message)
-            time.sleep(0.05)  # it is taken when a cloud comes or waits
+            publisher.publish(message)  # which lies in the queue of the node then
 
         yield b, say
 
@@ -306,20 +305,25 @@ def test_a_node_that_is_behind_takes_all_orientations_before_it_refuses(monkeypa
     with bench_with_imu() as (b, say):
         # They lie in the queue while it does something else, and there is no time to wait.
         monkeypatch.setattr(transforms, 'MAX_WAIT', 0.0)
-        is_busy = threading.Event()
-        b.node.executor.create_task(lambda: is_busy.set() or time.sleep(3.0))
-        is_busy.wait(10.0)
+        is_busy, is_free = threading.Event(), threading.Event()
+        b.node.executor.create_task(lambda: is_busy.set() or is_free.wait(ros.PATIENCE))
+        assert is_busy.wait(ros.PATIENCE)
         b.publisher.publish(message)
         for k in range(20):
             say(np.eye(3), (2, 10_000_000 * k))
         say(turn, (3, 1))
+        is_free.set()
         check_levelled(points, message, (b.ground.wait(1)[0], b.obstacles.wait(1)[0]))
         # They come late, the older ones first.
-        monkeypatch.setattr(transforms, 'MAX_WAIT', 0.2)
+        now = [0.0]
+        monkeypatch.setattr(transforms, 'time', types.SimpleNamespace(monotonic=lambda: now[0]))
         late = cloud_of(points, 5)
         b.publisher.publish(late)
+        wait_for(lambda: b.node._frames._waiting, 'cloud that waits')
+        now[0] = 0.9
         for k in range(10):
             say(np.eye(3), (4, 10_000_000 * k))
+        wait_for(lambda: b.node._frames._orientations[-1][0] == 4_090_000_000, 'older ones')
         say(turn, (5, 1))
         check_levelled(points, late, (b.ground.wait(2)[1], b.obstacles.wait(2)[1]))
 

@@ -29,11 +29,12 @@ TYPES = {
 }
 SPECS = parameter_specs()
 NAMES = [spec.name for spec in SPECS]
+DEFAULTS = {name: Config()[name] for name in ros.PATIENT}
 
 
 @pytest.fixture(scope='module')
 def shared():
-    with bench({'diagnostics.period': Config().diagnostics.period}) as b:
+    with bench(DEFAULTS) as b:
         assert values_of(b) == Config().flat()
         yield b
 
@@ -262,7 +263,7 @@ def test_unknown_names_are_reported_and_not_declared(tmp_path):
     }
     with ros.stderr_in(tmp_path) as said, ros.started_node(*ros.given(words)) as node:
         changes = {'sensor.height': 2.5, 'grid.r_max': 50.0, 'label.ground_tolerance': 1.0}
-        changes['diagnostics.period'] = 0.1
+        changes |= ros.PATIENT
         assert node.config == Config().replace(**changes)
         for name, value in changes.items():
             assert node.get_parameter(name).type_ == Parameter.Type.DOUBLE
@@ -278,7 +279,7 @@ def test_unknown_names_are_reported_and_not_declared(tmp_path):
 
 @pytest.mark.parametrize('height', ['auto', 4.5])
 def test_a_start_says_little_and_doubts_no_given_height_before_the_first_cloud(tmp_path, height):
-    words = ros.given({'sensor.height': height, 'diagnostics.period': 1.0})
+    words = ros.given({'sensor.height': height, **DEFAULTS})
     with ros.stderr_in(tmp_path) as said, ros.started_node(*words):
         log = said('listening to', *[CHANGED] * HAVE_NUMBA)
     assert ('parameters: all defaults (all values by ros2 param dump' in log) == (height == 'auto')

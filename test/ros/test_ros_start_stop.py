@@ -11,8 +11,9 @@ import pytest
 import rclpy
 import ros_helpers as ros
 from bag_samples import write_ros2_bag
-from cli_runner import children, is_running, stat_words
-from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
+from cli_runner import children, cpu_seconds, is_running
+from conftest import run_python
+from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, PATIENCE, Process, wait_for
 
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.schema import read_yaml, sections_of
@@ -113,14 +114,6 @@ def test_words_that_nobody_takes_are_refused(capsys, words):
     assert 'nonsense' in capsys.readouterr().err
 
 
-def errors_of(code, *words):
-    """The lines on standard error of a Python process that runs a code and says nothing else."""
-    command = [sys.executable, '-c', code, *words]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout) == (0, ''), done.stderr
-    return done.stderr.splitlines()
-
-
 NO_FOLDER = """
 import os
 import gp_ground_seg.ros.node  # once for all
@@ -136,9 +129,9 @@ for given in ({}, {'HOME': '/proc'}, {'ROS_LOG_DIR': '/proc'}):
 
 
 def test_logs_that_have_no_folder():
-    lines = errors_of(NO_FOLDER)
+    out, errors = run_python(NO_FOLDER)
     said = ': set ROS_LOG_DIR to a folder that the node may write to'
-    assert [line.endswith(said) for line in lines] == 3 * [True]
+    assert [line.endswith(said) for line in (out + errors).splitlines()] == 3 * [True]
 
 
 NO_ROS = """
@@ -152,8 +145,9 @@ for words in (['node'], ['play', sys.argv[1]], ['demo']):
 
 def test_missing_ros_is_said_in_one_line(tmp_path):
     write_ros2_bag(tmp_path / 'drive.mcap', 1)
-    lines = errors_of(NO_ROS, tmp_path / 'drive.mcap')
-    for command, line in zip(('the node', 'play', 'the demo'), lines, strict=True):
+    out, errors = run_python(NO_ROS, tmp_path / 'drive.mcap')
+    commands = 'the node', 'play', 'the demo'
+    for command, line in zip(commands, (out + errors).splitlines(), strict=True):
         assert f'{command} needs ROS 2, which cannot be imported' in line
         assert f'pip install {ROS_WHEELS}' in line
 
@@ -168,7 +162,7 @@ def test_missing_ros_is_said_in_one_line(tmp_path):
 )
 def test_middleware_of_another_installation_is_named(words, name):
     command, given = [sys.executable, *words], {**os.environ, 'RMW_IMPLEMENTATION': name}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=given)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=given)
     (line,) = done.stderr.splitlines()
     package = f'ros-jazzy-{name.replace("_", "-")}'
     assert done.returncode == 2 and line.endswith(f'stall {package}')
@@ -263,24 +257,31 @@ def test_unused_files_are_warned_of_with_their_keys(tmp_path):
 # Signals to the node: it ends with code 0, after the cloud at hand.
 
 
-def cpu_seconds(pid):
-    words = stat_words(pid)
-    return (int(words[11]) + int(words[12])) / os.sysconf('SC_CLK_TCK')
-
-
-def heeds_sigterm(process):
-    """Whether the process has a handler of its own."""
-    with open(f'/proc/{process.popen.pid}/status', encoding='ascii') as status:
-        caught = next(line for line in status if line.startswith('SigCgt:'))
-    return bool(int(caught.split()[1], 16) >> (signal.SIGTERM - 1) & 1)
+# The import of ROS removes the folder HOLD, and waits until that is there again.
+HOLD = """
+import os, sys, time
+class Importer:
+    def find_spec(self, name, *_):
+        if name == 'rclpy':
+            sys.meta_path.remove(self)
+            os.rmdir(os.environ['HOLD'])
+            while not os.path.exists(os.environ['HOLD']):
+                time.sleep(0.01)
+sys.meta_path.insert(0, Importer())
+"""
 
 
 @pytest.mark.parametrize(
     ('start', 'number'), [(ros.ENTRY_POINT, signal.SIGINT), (MODULE, signal.SIGTERM)]
 )
 def test_while_importing(tmp_path, start, number):
-    with Process(*FIXED, folder=tmp_path, start=start) as node:
-        wait_for(lambda: heeds_sigterm(node), 'handler')
+    (hold := tmp_path / 'hold').mkdir()
+    (tmp_path / 'sitecustomize.py').write_text(HOLD)
+    environment = {'HOLD': str(hold), 'PYTHONPATH': os.pathsep.join([str(tmp_path), *sys.path])}
+    with Process(*FIXED, folder=tmp_path, start=start, **environment) as node:
+        wait_for(lambda: not hold.exists(), 'import of ROS')
+        node.popen.send_signal(number)
+        hold.mkdir()
         node.end_well(number)
         assert 'listening' not in node.log
 
@@ -344,7 +345,7 @@ def test_sigint_that_was_ignored_at_the_start_ends_the_player_and_the_node(tmp_p
     with Process(folder=tmp_path, command=node) as node, ros.linked(sends=None) as link:
         with Process(folder=tmp_path, command=player) as player:
             link.ground.wait(4)
-            assert player.stop(signal.SIGINT)[0] == 130
+            assert player.stop(signal.SIGINT) == 130
             assert player.log.splitlines()[-1] == 'gp-ground-seg: interrupted'
         node.end_well(signal.SIGINT)
 
@@ -353,10 +354,11 @@ STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @pytest.fixture
-def handlers(heeded_hangup):
-    """The handlers in use, which are there again after the test."""
+def handlers():
+    """Handlers as in a terminal, also under nohup; those in use are there again after the test."""
     before = {number: signal.getsignal(number) for number in STOPS}
-    yield before
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield {**before, signal.SIGHUP: signal.SIG_DFL}
     for number, handler in before.items():
         signal.signal(number, handler)
 
