@@ -36,7 +36,8 @@ from gp_ground_seg.core.pipeline.labels import (
 from gp_ground_seg.core.pipeline.lines import find_lines, trace
 from gp_ground_seg.core.pipeline.points import in_columns
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
-from gp_ground_seg.core.pipeline.relief import Relief, with_standing
+from gp_ground_seg.core.pipeline.relief import Relief
+from gp_ground_seg.core.pipeline.terrain import with_standing
 
 
 class NumbaBackend:

@@ -10,6 +10,7 @@ Where images are the lowest returns of most cells, the plane of the ground is lo
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,9 @@ from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
 DEEP, DEEPEST = 0.15, 10.0
 """Depths below the plane at which a return may be an image [m]: more than that of a kerb."""
+BELOW = 0.08
+"""Depth below the ground before it, from which a return below the line of sight to ground is an
+image on a wet road [m]: noise is less. At the foot of a wall images are no deeper."""
 OVER_SIGHT = 0.05
 """Height up to which a ray to an image passes over ground that is seen nearer [m]: noise. Of rays
 that meet the road side by side some come back from it, others from what they are mirrored to."""
@@ -65,8 +69,9 @@ NO_IMAGES = MirrorImages(np.zeros(0, dtype=np.int64), np.zeros(0))
 def find_mirror_images(scan: Scan, pose: SensorPose) -> MirrorImages:
     """Find the mirror images of a scan in the level frame: none unless the road is wet.
 
-    An image is deep below the plane, and hardly above the line of sight to ground that is seen
-    nearer. Where rays start must be known, or nothing is told.
+    An image is below the ground before it, as deep as what it is an image of is high, and hardly
+    above the line of sight to ground that is seen nearer. Where rays start must be known, or
+    nothing is told.
     """
     grid, plane_z = scan.grid, -pose.sensor_height
     is_known = pose.starts_rays and plane_z < 0.0
@@ -78,11 +83,21 @@ def find_mirror_images(scan: Scan, pose: SensorPose) -> MirrorImages:
     is_ground = (r >= NEAREST) & (r < GROUND_REACH) & (np.abs(z - plane_z) <= tolerance_at(r))
     shape = grid.n_segments, grid.n_bins
     nearer = _nearer_about(slope[is_ground], cell[is_ground], shape, N_ASIDE)[cell]
-    may_be = (z < plane_z - DEEP) & (r >= NEAREST) & (r < IMAGE_REACH)
+    # Ground in tiles in which nothing stands.
+    extremes = scan.tiles.extremes[scan.tiles.tile[inside]]
+    is_bare = is_ground & (slope >= nearer) & (extremes[:, 1] - extremes[:, 0] < 2.0 * DEEP)
     # Only a line of sight that points down meets the plane: at its height over its slope.
-    may_be &= (nearer < 0.0) & ((slope - nearer) * plane_z > OVER_SIGHT * nearer)
-    found = np.flatnonzero(may_be)
-    return MirrorImages(inside[found], -2.0 * (z[found] - plane_z))
+    can_be = (nearer < 0.0) & ((slope - nearer) * plane_z > OVER_SIGHT * nearer)
+    can_be &= (r >= NEAREST) & (r < IMAGE_REACH)
+    is_image = np.zeros(len(z), dtype=np.bool_)
+    for _ in range(2):  # the second time without images that count as ground the first time
+        tells = is_bare & ~is_image
+        before = _ground_before(z[tells], cell[tells], shape)[cell]
+        is_seen = np.isfinite(before)
+        mirror_z = np.where(is_seen, before, plane_z)
+        is_image = can_be & (z < mirror_z - np.where(is_seen, BELOW, DEEP))
+    found = np.flatnonzero(is_image)
+    return MirrorImages(inside[found], 2.0 * (mirror_z[found] - z[found]))
 
 
 @np.errstate(invalid='ignore', over='ignore')
@@ -152,4 +167,17 @@ def _nearer_about(
         highest = np.maximum(highest, both)
     before: FloatArray = np.full(shape, -np.inf)
     np.maximum.accumulate(highest[:, :-1], axis=1, out=before[:, 1:])
+    return before.reshape(-1)
+
+
+def _ground_before(z: FloatArray, cell: IntArray, shape: tuple[int, int]) -> FloatArray:
+    """Mean height of the ground in the last bin before each cell that has some [m], or NaN.
+
+    `z` and `cell`, (G,), are those of the ground.
+    """
+    number, total = (np.bincount(cell, w, math.prod(shape)).reshape(shape) for w in (None, z))
+    last = np.maximum.accumulate(np.where(number > 0, np.arange(shape[1]), 0), axis=1)
+    before: FloatArray = np.full(shape, np.nan)
+    with np.errstate(invalid='ignore'):
+        before[:, 1:] = np.take_along_axis(total / number, last[:, :-1], axis=1)
     return before.reshape(-1)

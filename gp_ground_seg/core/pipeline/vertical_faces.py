@@ -26,7 +26,6 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, FacesConfig, LabelConfig
-from gp_ground_seg.core.pipeline.relief import MAX_SLOPE, longest_gap
 from gp_ground_seg.core.pipeline.roughness import (
     N_LEVELS,
     ROUGHNESS,
@@ -37,6 +36,7 @@ from gp_ground_seg.core.pipeline.roughness import (
     level_at,
     levels_about,
 )
+from gp_ground_seg.core.pipeline.terrain import MAX_SLOPE, longest_gap
 
 MIN_RETURNS = 4
 """Returns that a tile needs to have an orientation."""

@@ -1,0 +1,289 @@
+"""Compiled twin of `gp_ground_seg.core.pipeline.terrain`."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from gp_ground_seg.core.frame import BoolArray, Candidates, Faces, FloatArray, IntArray
+from gp_ground_seg.core.jit import jit
+from gp_ground_seg.core.parameters.config import GrowthConfig
+from gp_ground_seg.core.pipeline.terrain import (
+    MIN_ENTRY,
+    MIN_SEEDS,
+    N_ASIDE,
+    RAISED,
+    REACH,
+    STEEP,
+    arc_of,
+    can_step,
+    falls,
+    goes_on,
+    is_gentle,
+    largest_gap,
+    least_width,
+    longest_gap,
+)
+
+
+class _Walk(NamedTuple):
+    """What the steps taken so far lead to."""
+
+    parent: IntArray  # (C,) a tree for each group of candidates that steps join
+    is_raised: BoolArray  # (C,) allowed candidates that are raised
+    part: IntArray  # (C,) as `parent`, by steps between raised candidates alone
+    is_foot: BoolArray  # (C,) raised candidates, to which it is too steep from one that is not
+    is_entry: BoolArray  # (C,) raised candidates that a step from one that is not leads to
+    is_fallen: BoolArray  # (C,) candidates that a fall leads to
+
+
+@jit()
+def reachable(
+    candidates: Candidates,
+    faces: Faces,
+    height: float,
+    growth: GrowthConfig,
+    stands: BoolArray,
+) -> tuple[BoolArray, BoolArray]:
+    """See the plain `reachable`, of which the third result is `stands`, to be set."""
+    r, n = candidates.r, len(candidates.r)
+    allowed, is_steep = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    marks = np.zeros((4, n), np.bool_)
+    walk = _Walk(np.arange(n), marks[0], np.arange(n), marks[1], marks[2], marks[3])
+    for c in range(n):
+        tile = np.uintp(candidates.tile[c])
+        allowed[c], is_steep[c] = r[c] < REACH and not faces.is_face[tile], faces.is_steep[tile]
+        walk.is_raised[c] = allowed[c] and candidates.z[c] + height > RAISED
+    steep, down = _step_along(candidates, allowed, is_steep, walk)
+    for aside in range(1, N_ASIDE + 1):
+        _step_aside(candidates, allowed, is_steep, aside, walk)
+    _step_in_front(candidates, steep, is_steep, walk)
+    _step_in_front(candidates, down, is_steep, walk)
+    is_terrain = allowed.copy()
+    _leave_out_not_entered(candidates, walk, is_terrain, stands)
+    parent, n_seeds = walk.parent, np.zeros(n, np.int64)
+    for c in range(n):
+        walk.is_fallen[c] &= is_terrain[c] and is_terrain[c - 1]
+        if walk.is_fallen[c]:
+            _join(parent, c - 1, c)
+    for c in range(n):
+        parent[c] = _root(parent, c)
+        is_near = allowed[c] and r[c] < growth.seed_range
+        if is_near and abs(candidates.z[c] + height) < growth.seed_height_tolerance:
+            n_seeds[parent[c]] += 1
+    is_terrain &= n_seeds[parent] >= MIN_SEEDS
+    return _sides_of(candidates, is_terrain, walk.is_fallen)
+
+
+@jit()
+def _sides_of(
+    candidates: Candidates, reached: BoolArray, is_fallen: BoolArray
+) -> tuple[BoolArray, BoolArray]:
+    """Candidates that are `reached`: those before falls, and those behind and below one."""
+    offsets, behind = candidates.offsets, np.zeros_like(reached)
+    for m in range(len(offsets) - 1):
+        edge = -np.inf
+        for c in range(offsets[m], offsets[m + 1]):
+            if is_fallen[c] and reached[c]:
+                edge = candidates.z[c - 1]
+            behind[c] = reached[c] and candidates.z[c] < edge - STEEP
+    return reached & ~behind, behind
+
+
+@jit()
+def _step(walk: _Walk, a: int, b: int) -> None:
+    """Take a step between two candidates."""
+    _join(walk.parent, a, b)
+    if walk.is_raised[a] and walk.is_raised[b]:
+        _join(walk.part, a, b)
+    elif walk.is_raised[a]:
+        walk.is_entry[a] = True
+    elif walk.is_raised[b]:
+        walk.is_entry[b] = True
+
+
+@jit()
+def _mark_foot(walk: _Walk, a: int, b: int) -> None:
+    """Mark the one of two candidates that is raised, if the other is not."""
+    if walk.is_raised[a] != walk.is_raised[b]:
+        walk.is_foot[a if walk.is_raised[a] else b] = True
+
+
+@jit()
+def _leave_out_not_entered(
+    candidates: Candidates, walk: _Walk, is_terrain: BoolArray, stands: BoolArray
+) -> None:
+    """See the plain `_entered`. A part of raised terrain is reached as a whole, or not at all."""
+    offsets, is_before = candidates.offsets, np.zeros(len(is_terrain), np.bool_)
+    for m in range(len(offsets) - 1):
+        sees_lower = False
+        for c in range(offsets[m + 1] - 1, offsets[m] - 1, -1):
+            is_before[c] = sees_lower and walk.is_raised[c]
+            sees_lower |= is_terrain[c] and not walk.is_raised[c]
+    entry = _widths(candidates, walk.part, walk.is_entry)
+    foot = _widths(candidates, walk.part, walk.is_foot)
+    before = _widths(candidates, walk.part, is_before)
+    for c in range(len(is_terrain)):
+        if walk.is_raised[c]:
+            part = _root(walk.part, c)
+            is_terrain[c] = entry[part] >= MIN_ENTRY
+            has_foot = min(foot[part], before[part]) >= MIN_ENTRY
+            stands[c] = has_foot and not is_terrain[c]
+
+
+@jit()
+def _widths(candidates: Candidates, part: IntArray, marked: BoolArray) -> FloatArray:
+    """Width of the segments with a `marked` candidate, by the nearest one, at the root of a part.
+
+    (C,), in m.
+    """
+    r, offsets = candidates.r, candidates.offsets
+    width, last = np.zeros(len(r)), np.zeros(len(r), np.int64)
+    for m in range(len(offsets) - 1):
+        for c in range(offsets[m], offsets[m + 1]):
+            if marked[c]:
+                root = _root(part, c)
+                # One more than the segment, as 0 is none.
+                if last[root] != m + 1:
+                    width[root] += arc_of(r[c], len(offsets) - 1)
+                    last[root] = m + 1
+    return width
+
+
+@jit()
+def _step_along(
+    candidates: Candidates, allowed: BoolArray, is_steep: BoolArray, walk: _Walk
+) -> tuple[IntArray, IntArray]:
+    """Step between neighbours of a segment.
+
+    Returns the far ends of the steep and long steps, and those of falls and of the steps among the
+    others that lead down.
+    """
+    r, z, offsets = candidates.r, candidates.z, candidates.offsets
+    is_end, is_end_down = np.zeros(len(r), np.bool_), np.zeros(len(r), np.bool_)
+    for m in range(len(offsets) - 1):
+        for c in range(offsets[m] + 1, offsets[m + 1]):
+            dr, rise = r[c] - r[c - 1], z[c] - z[c - 1]
+            if not (allowed[c] and allowed[c - 1]):
+                continue
+            if dr > largest_gap(r[c]):
+                is_taken = dr <= longest_gap(r[c]) and _goes_on(candidates, offsets[m], c)
+            else:
+                over_steep, is_taken = is_steep[c - 1] or is_steep[c], can_step(dr, rise, STEEP)
+                if is_taken and is_gentle(rise, over_steep):
+                    _step(walk, c - 1, c)
+                    continue
+                is_sheer = over_steep or not can_step(dr, rise, math.inf)
+                if is_sheer and (is_taken or not falls(dr, rise)):
+                    _mark_foot(walk, c - 1, c)
+            walk.is_fallen[c] = not is_taken and falls(dr, rise)
+            is_end[c] = is_taken
+            is_end_down[c] = walk.is_fallen[c] or (is_taken and rise < 0.0)
+    return np.flatnonzero(is_end), np.flatnonzero(is_end_down)
+
+
+@jit()
+def _goes_on(candidates: Candidates, first: int, c: int) -> bool:
+    """Whether the step to candidate `c`, in the segment from `first` on, goes on as before."""
+    r, z, before = candidates.r, candidates.z, c - 1
+    dr = r[c] - r[c - 1]
+    while before >= first and r[before] > r[c - 1] - 0.5 * dr:
+        before -= 1
+    if before < first:
+        return False
+    slope_before = (z[c - 1] - z[before]) / (r[c - 1] - r[before])
+    return bool(goes_on((z[c] - z[c - 1]) / dr, slope_before))
+
+
+@jit()
+def _step_in_front(
+    candidates: Candidates, steep: IntArray, is_steep: BoolArray, walk: _Walk
+) -> None:
+    """Take the steep and long steps in a front; `steep` (S,) are their far ends, in order.
+
+    Falls that are not in one are none.
+    """
+    offsets, n_segments = candidates.offsets, len(candidates.offsets) - 1
+    starts = np.searchsorted(steep, offsets)
+    segment = np.searchsorted(offsets, steep, side='right') - 1
+    front = np.arange(len(steep))
+    for aside in range(1, N_ASIDE + 1):
+        for k in range(len(steep)):
+            beside = (segment[k] + aside) % n_segments
+            _join_front(candidates, steep, k, starts[beside], starts[beside + 1], front)
+    width = np.zeros(len(steep))
+    for k in range(len(steep)):
+        front[k] = _root(front, k)
+        width[front[k]] += arc_of(candidates.r[steep[k] - 1], n_segments)
+    for k in range(len(steep)):
+        over_steep = is_steep[steep[k] - 1] or is_steep[steep[k]]
+        is_wide = width[front[k]] >= least_width(over_steep)
+        if walk.is_fallen[steep[k]]:
+            walk.is_fallen[steep[k]] = is_wide
+        elif is_wide:
+            _step(walk, steep[k] - 1, steep[k])
+
+
+@jit()
+def _join_front(
+    candidates: Candidates, steep: IntArray, k: int, first: int, stop: int, front: IntArray
+) -> None:
+    """Join step `k` with those of `first` to `stop` that are side by side with it."""
+    r, z, near, far = candidates.r, candidates.z, steep[k] - 1, steep[k]
+    while first < stop and r[steep[first]] < r[near]:
+        first += 1
+    for other in range(first, min(first + 2, stop)):
+        a, b = steep[other] - 1, steep[other]
+        overlaps = min(z[a], z[b]) <= max(z[near], z[far])
+        overlaps &= min(z[near], z[far]) <= max(z[a], z[b])
+        if overlaps and r[a] <= r[far]:
+            _join(front, k, other)
+
+
+@jit()
+def _step_aside(
+    candidates: Candidates, allowed: BoolArray, is_steep: BoolArray, aside: int, walk: _Walk
+) -> None:
+    """Step from each candidate to the next ones in range of the segment so many further on."""
+    r, z, offsets = candidates.r, candidates.z, candidates.offsets
+    n_segments = len(offsets) - 1
+    for m in range(n_segments):
+        beside = (m + aside) % n_segments
+        first, stop = offsets[beside], offsets[beside + 1]
+        behind = first
+        for c in range(offsets[m], offsets[m + 1]):
+            while behind < stop and r[behind] < r[c]:
+                behind += 1
+            if not allowed[c]:
+                continue
+            across, gap = aside * arc_of(r[c], n_segments), 0.5 * largest_gap(r[c])
+            for there in range(max(behind - 1, first), min(behind + 1, stop)):
+                dr = abs(r[there] - r[c])
+                # Most are joined already; of raised ones it also matters what leads to them.
+                is_done = walk.parent[c] == walk.parent[there]
+                if is_done and not (walk.is_raised[c] or walk.is_raised[there]):
+                    continue
+                if allowed[there] and dr <= gap:
+                    distance = math.sqrt(dr * dr + across * across)
+                    rise, over_steep = z[there] - z[c], is_steep[c] or is_steep[there]
+                    can_be = can_step(distance, rise, math.inf)
+                    if can_be and is_gentle(rise, over_steep):
+                        _step(walk, c, there)
+                    elif over_steep or not can_be:
+                        _mark_foot(walk, c, there)
+
+
+@jit()
+def _root(parent: IntArray, c: int) -> int:
+    while parent[c] != c:
+        parent[c] = parent[parent[c]]
+        c = parent[c]
+    return c
+
+
+@jit()
+def _join(parent: IntArray, a: int, b: int) -> None:
+    a, b = _root(parent, a), _root(parent, b)
+    parent[max(a, b)] = min(a, b)
