@@ -83,21 +83,22 @@ def find_mirror_images(scan: Scan, pose: SensorPose) -> MirrorImages:
     is_ground = (r >= NEAREST) & (r < GROUND_REACH) & (np.abs(z - plane_z) <= tolerance_at(r))
     shape = grid.n_segments, grid.n_bins
     nearer = _nearer_about(slope[is_ground], cell[is_ground], shape, N_ASIDE)[cell]
-    # Ground in tiles in which nothing stands.
-    extremes = scan.tiles.extremes[scan.tiles.tile[inside]]
-    is_bare = is_ground & (slope >= nearer) & (extremes[:, 1] - extremes[:, 0] < 2.0 * DEEP)
     # Only a line of sight that points down meets the plane: at its height over its slope.
     can_be = (nearer < 0.0) & ((slope - nearer) * plane_z > OVER_SIGHT * nearer)
-    can_be &= (r >= NEAREST) & (r < IMAGE_REACH)
+    can_be &= (r >= NEAREST) & (r < IMAGE_REACH) & (z < plane_z + DEEP)
+    low = np.flatnonzero(can_be)
+    bare = np.flatnonzero(is_ground & (slope >= nearer))
+    extremes = scan.tiles.extremes[scan.tiles.tile[inside[bare]]]
+    bare = bare[extremes[:, 1] - extremes[:, 0] < 2.0 * DEEP]  # where nothing stands
     is_image = np.zeros(len(z), dtype=np.bool_)
     for _ in range(2):  # the second time without images that count as ground the first time
-        tells = is_bare & ~is_image
-        before = _ground_before(z[tells], cell[tells], shape)[cell]
+        tells = bare[~is_image[bare]]
+        before = _ground_before(z[tells], cell[tells], shape)[cell[low]]
         is_seen = np.isfinite(before)
         mirror_z = np.where(is_seen, before, plane_z)
-        is_image = can_be & (z < mirror_z - np.where(is_seen, BELOW, DEEP))
-    found = np.flatnonzero(is_image)
-    return MirrorImages(inside[found], 2.0 * (mirror_z[found] - z[found]))
+        is_image[low] = is_deep = z[low] < mirror_z - np.where(is_seen, BELOW, DEEP)
+    rise = 2.0 * (mirror_z - z[low])
+    return MirrorImages(inside[low[is_deep]], rise[is_deep])
 
 
 @np.errstate(invalid='ignore', over='ignore')
