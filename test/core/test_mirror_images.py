@@ -51,17 +51,17 @@ def test_images_are_found_and_raised_and_the_wet_road_is_ground(backend, sensor,
     assert not is_image[truth | (height > 0.0)].any()
     raised = found.raised(points[:, :3]) - points[:, :3]
     np.testing.assert_array_equal(np.flatnonzero(raised.any(axis=1)), found.points)
-    # The plane is up to 0.17 m off where images are told, and so twice that what is raised.
-    mirrored = height[found.points] + found.rise
-    np.testing.assert_allclose(mirrored, -height[found.points], atol=0.35)
+    # Most are raised over the ground before them; without any, over the plane, up to 0.17 m off.
+    missed = np.abs(2.0 * height[found.points] + found.rise)
+    assert missed.max() < 0.35 and np.quantile(missed, 0.9) < 0.05
     result = GroundSegmenter(backend=backend).segment(points)
     is_ground = result.label == Label.GROUND
     assert (is_ground & truth).sum() / (is_ground | truth).sum() > 0.93
     below = ~truth & (height < -0.3)
     assert is_ground[below].mean() < 0.01
     # The ground at an image is above it.
-    missed = (result.ground_z - scan.ground_z)[below]
-    assert np.nanmedian(np.abs(missed)) < 0.01
+    off = (result.ground_z - scan.ground_z)[below]
+    assert np.nanmedian(np.abs(off)) < 0.01
     # Raised to the underside of a car, an image would be ground that climbs to the roofs behind.
     candidates = result.frame.candidates
     at_images = {tuple(place) for place in points[found.points, :2].astype(np.float64).tolist()}
