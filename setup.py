@@ -67,6 +67,7 @@ setup(
     maintainer='gp_ground_seg maintainers',
     maintainer_email='maintainers@users.noreply.h-seed-aac284b4.example',
     python_requires='>=3.10',
+    package_dir={'': '.'},  # an editable install is then a path, found also from above a clone
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={PACKAGE: ['py.typed']},
     data_files=[

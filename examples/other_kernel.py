@@ -1,7 +1,9 @@
 """Fit a kernel of scikit-learn to our inliers, segment by segment: SCAN [PRESET].
 
-Needs scikit-learn (`pip install scikit-learn`). Both surfaces are fitted to the same inliers and
-compared at the same ranges; neither is the truth. Put your own kernel into KERNEL.
+Needs scikit-learn (`pip install scikit-learn`). Both surfaces rest on the same inliers and
+are compared at the same ranges; neither is the truth. Ours also uses neighbours, the relief of the
+terrain, a sloping mean and weights of the inliers: not with PRESET `paper`. Put your own kernel
+into KERNEL.
 """
 
 import sys

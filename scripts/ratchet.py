@@ -40,7 +40,7 @@ def main() -> int:
     code = 0
     for name, n in count(root).items():
         limit = limits.get(name, 0)
-        verdict = 'ABOVE, see CONTRIBUTING.md' if n > limit else ''
+        verdict = 'ABOVE: remove some, or commit a higher limit first' if n > limit else ''
         code = max(code, n > limit)
         print(f'{name:18} {n:6} of {limit:6} {verdict}'.rstrip())
     return code

@@ -26,8 +26,8 @@ SEGMENT = """\
 The paper's Figure 1 for any scan and segment, or two side by side: points, ground
 candidates, the lines through them with their critical points, the inliers, and the
 estimated ground with twice its standard deviation; below it the length-scale and its
-pseudo-inputs. Segments are numbered counter-clockwise from straight behind; of 180 the 90th
-is ahead, to the left.
+pseudo-inputs. Of n segments number m begins at azimuth -180 + m * 360/n degrees,
+counter-clockwise from ahead: 90 of 180 is ahead, to the left.
 """
 SEGMENT_EXAMPLES = """\
   gp-ground-seg plot segment 000000.bin --segment 90 -o ahead.pdf

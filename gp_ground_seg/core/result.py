@@ -50,42 +50,55 @@ def cached_property(compute: Callable[[Any], _Value]) -> functools.cached_proper
 
 @dataclass(frozen=True)
 class FitReport:
-    """Outcome of the learning and of the inlier growth."""
+    """Outcome of the learning and of the inlier growth.
 
-    mode: str  #: ``learning.mode`` of the frame
-    #: ``converged``, ``budget`` or ``failed``; ``kept`` when nothing was learned on this frame
+    - `mode`: ``learning.mode``; `backend`: ``numba`` or ``numpy``
+    - `status`: ``converged``, ``budget``, ``failed``; ``kept``: nothing was learned on this frame
+    - `n_evaluations` of the objective; `objective` per inlier at the end, NaN if ``kept``
+    - `theta`: values, not logarithms: sigma_f, sigma_n, sigma_l_bar [m], sigma_f_bar, sigma_n_bar,
+      and the factor on lines' length-scales, or one for each class; `at_bound`: those at a bound
+    - `n_segments` with a model, `n_candidates`, `n_inliers` that the surface rests on, `n_lines`
+      among the candidates, `n_pseudo_inputs` of the latent process
+    """
+
+    mode: str
     status: str
-    n_evaluations: int  #: evaluations of the objective
-    objective: float  #: objective per inlier at the end; NaN when nothing was learned
-    #: hyper-parameters used (sigma_f, sigma_n [m], sigma_f_bar, sigma_l_bar [m], sigma_n_bar, and
-    #: the factor on the length-scales that the lines suggest, or one for each class of lines)
+    n_evaluations: int
+    objective: float
     theta: dict[str, float]
-    at_bound: tuple[str, ...]  #: those that ended at a bound
-    n_segments: int  #: segments with a ground model
-    n_candidates: int  #: ground candidates
-    n_inliers: int  #: those the surface rests on
-    n_lines: int  #: lines among the candidates
-    n_pseudo_inputs: int  #: pseudo-inputs of the latent process
-    backend: str  #: ``numba`` or ``numpy``
+    at_bound: tuple[str, ...]
+    n_segments: int
+    n_candidates: int
+    n_inliers: int
+    n_lines: int
+    n_pseudo_inputs: int
+    backend: str
 
 
 class Segment(NamedTuple):
     """One segment of a scan: what the processes of the paper observe, and what they predict.
 
-    Ranges are horizontal distances from the sensor; heights are over it, along the vertical, which
-    is the sensor's z axis where ``pose`` has no tilt.
+    Ranges are horizontal, from the sensor; heights are over it, along the vertical: its z axis if
+    ``pose`` has no tilt. With the preset ``paper`` `mean` and `cov` are equations 6 and 7; else
+    neighbours, relief, a sloping mean and weights of the inliers act on them too.
+
+    - `r`, `z`, `inlier` (C,): range and height of candidates [m]; does the surface rest on them?
+    - `pseudo_r`, `pseudo_l` (P,): range and length-scale of the latent pseudo-inputs [m]
+    - `knots`, `mean`, `std`, `length_scale` (K,): ranges of prediction; height of the ground,
+      its standard deviation, length-scale of the kernel there [m]; none without a model
+    - `cov` (K, K): posterior covariance of these heights [m^2]; its diagonal is ``std**2``
     """
 
-    r: FloatArray  #: (C,) horizontal range of each ground candidate [m]
-    z: FloatArray  #: (C,) its height [m]
-    inlier: BoolArray  #: (C,) whether the surface rests on it
-    pseudo_r: FloatArray  #: (P,) range of each pseudo-input [m]; none without a latent process
-    pseudo_l: FloatArray  #: (P,) its length-scale, L-bar [m]
-    knots: FloatArray  #: (K,) ranges at which the ground is predicted [m]; none without a model
-    mean: FloatArray  #: (K,) height of the ground there [m]
-    std: FloatArray  #: (K,) its standard deviation [m]
-    cov: FloatArray  #: (K, K) posterior covariance of these heights; its diagonal is ``std**2``
-    length_scale: FloatArray  #: (K,) length-scale of the kernel there [m]
+    r: FloatArray
+    z: FloatArray
+    inlier: BoolArray
+    pseudo_r: FloatArray
+    pseudo_l: FloatArray
+    knots: FloatArray
+    mean: FloatArray
+    std: FloatArray
+    cov: FloatArray
+    length_scale: FloatArray
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -153,10 +166,7 @@ class Segmentation:
 
     def __repr__(self) -> str:
         """One line: a scan has too many numbers to print."""
-        n_ground, n_obstacle = (
-            in_thousands(np.count_nonzero(self.label == kind))
-            for kind in (Label.GROUND, Label.OBSTACLE)
-        )
+        _, n_ground, n_obstacle = map(in_thousands, np.bincount(self.label, minlength=3))
         return (
             f'<Segmentation of {in_thousands(len(self.label))} points: {n_ground} ground, '
             f'{n_obstacle} obstacle; origin {self.pose.height:.2f} m over the ground>'

@@ -280,7 +280,7 @@ UPS = {
 }
 
 
-OVER = [('z does not point up: ', f'with {up} up', turn) for up, turn in UPS.items()]
+OVER = [('z does not point up: ', f'with {up} nearest to up', turn) for up, turn in UPS.items()]
 LEANING = [
     ('z does not point up: ', '', (math.radians(50.0), 0.0)),
     ('z is tilted by 47 degrees: ', '', (math.radians(33.5), math.radians(35.0))),
@@ -352,5 +352,5 @@ def test_real_frames(kitti, first):
             np.testing.assert_allclose(
                 (lean.roll - base.roll, lean.pitch - base.pitch), (0.1, -0.08), atol=0.02
             )
-        with pytest.raises(PointCloudError, match=f'with {up} up'):
+        with pytest.raises(PointCloudError, match=f'with {up} nearest to up'):
             pose_of(tilted(points, *angles))

@@ -33,9 +33,9 @@ def test_the_commands_of_readme_work_one_after_the_other(tmp_path):
     assert said.count('m over the ground (estimated), level') == 2
     for name in ('street.png', 'mine.png'):
         assert (clone / name).stat().st_size > 10_000
-    hilly_scan().astype('<f4')[:, [0, 1, 2, 2]].tofile(clone / 'scan.bin')
-    (clone / 'five_lines.py').write_text(*try_it('python'))
-    run('.venv/bin/python five_lines.py && rm five_lines.py scan.bin', clone)
+    hilly_scan().astype('<f4')[:, [0, 1, 2, 2]].tofile(tmp_path / 'scan.bin')
+    (tmp_path / 'five_lines.py').write_text(*try_it('python'))
+    run(f'{clone}/.venv/bin/python five_lines.py', tmp_path)  # a clone in sight
     said = run(demo, clone)
     assert 'IoU' in said and 'from PyPI into .venv-dev' in said
     assert re.search(r'\d+ MB downloaded, \d+ MB in \.venv-dev', said)

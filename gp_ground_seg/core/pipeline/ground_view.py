@@ -228,6 +228,6 @@ def refusal(view: View, given: FloatArray) -> str:
     problem = f'z is tilted by {tilt:.0f} degrees' if axis == 'z' else 'z does not point up'
     height = view.plane.height * view.plane.normal[2]
     return (
-        f'{problem}: the ground seems to be {height:.2f} m away with {axis} up; turn '
+        f'{problem}: the ground seems to be {height:.2f} m away with {axis} nearest to up; turn '
         f'the cloud, or set sensor.roll to {roll:.3f} and sensor.pitch to {pitch:.3f} [rad]'
     )
