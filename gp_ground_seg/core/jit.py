@@ -184,13 +184,12 @@ class _CodeFile:
 
     def save(self, key: object, code: object) -> None:
         """Write what was compiled; a full disk is a warning."""
-        from numba.core.serialize import dumps
-
         try:
-            content = dumps({**self._read(), key: code})
+            content = pickle.dumps({**self._read(), key: code})
             self._path.write_bytes(hashlib.sha256(content).digest() + content)
             _list(self._path)
-        except OSError as error:
+        except (OSError, pickle.PickleError, TypeError, AttributeError) as error:
+            # The disk, or a version of numba whose code cannot be pickled.
             _log_not_kept(error)
         finally:
             self._end_turn()
