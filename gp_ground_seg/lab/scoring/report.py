@@ -114,10 +114,7 @@ def require_pandas() -> Any:
 
 def records(frame: DataFrame) -> list[dict[str, Any]]:
     """Return the rows with values of Python, None for NaN."""
-    found: list[dict[str, Any]] = (
-        frame.astype(object).where(frame.notna(), None).to_dict('records')
-    )
-    return found
+    return list(frame.astype(object).where(frame.notna(), None).to_dict('records'))
 
 
 class Report(NamedTuple):

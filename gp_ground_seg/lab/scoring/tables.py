@@ -64,8 +64,7 @@ def clusters(scores: Scores) -> DataFrame:
         return found
     n = len(found)
     n_blocks = max(min(N_BLOCKS, n // MIN_BLOCK), 1)
-    ends = [n * k // n_blocks for k in range(1, n_blocks)]
-    return found.assign(cluster=np.searchsorted(ends, np.arange(n), side='right'))
+    return found.assign(cluster=((np.arange(n) + 1) * n_blocks - 1) // n)
 
 
 def interval_text(
@@ -164,7 +163,7 @@ def evaluation(scores: Scores, config: Config) -> Report:
     labelled scans is a column here.
     """
     minus = f' minus that of {scores.peer}' if scores.peer else ''
-    layouts = (
+    layouts: tuple[tuple[Any, ...], ...] = (
         ('groundgrid', 'GroundGrid convention: vegetation left out [%]',
          scores.scans, 'sequence', ['n_scans', *metrics.LABEL_MEASURES]),
         ('low_things', 'Low objects and false cells [%]', scores.scans, 'sequence',
