@@ -1,7 +1,5 @@
 """Entry point of ``gp-ground-seg``: commands, and errors mapped to exit codes."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import io

@@ -1,7 +1,5 @@
 """``node``: the ROS 2 node; ``warm-up``: its compiled code; ``config``: its parameter files."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time
@@ -42,7 +40,7 @@ ros__parameters:). Exit code 2 if anything is wrong.
 """
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: options.Subparsers) -> None:
     """Declare the commands; what follows ``--ros-args`` is left to ROS or the node."""
     description = 'Run the ROS 2 node: points in, ground and obstacles out.'
     parser = options.command(

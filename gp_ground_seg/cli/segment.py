@@ -29,14 +29,13 @@ from gp_ground_seg.lab.cluster import Progress
 DESCRIPTION = """\
 Split scans into ground and obstacles.
 
-INPUT is a scan (.bin .pcd .ply .npy .npz), a folder or sequence of scans, a bag
-(.bag .mcap .db3, or a rosbag2 folder), or a KITTI_ROOT. docs/datasets.md has more
-on formats, and on whole data sets.
+INPUT is a scan (.bin .pcd .ply .npy .npz), a folder or sequence of scans, a bag (.bag .mcap .db3,
+or a rosbag2 folder), or a KITTI_ROOT. docs/datasets.md has more on formats, and on whole data
+sets.
 
-A .bin gives a .label file: 40 = ground, 99 = obstacle, 0 = no return (SemanticKITTI).
-Other scans keep their format and get label (1 ground, 2 obstacle, 0 no return), height,
-ground_z, ground_std and p_ground. A bag gives a rosbag2 of the ground and the obstacles of each
-cloud.
+A .bin gives a .label file: 40 = ground, 99 = obstacle, 0 = no return (SemanticKITTI). Other scans
+keep their format and get label (1 ground, 2 obstacle, 0 no return), height, ground_z, ground_std
+and p_ground. A bag gives a rosbag2 of the ground and the obstacles of each cloud.
 
 If it is run again with the same arguments, inputs whose output is newer are skipped.
 
@@ -56,7 +55,7 @@ TOPICS = {'/ground': Label.GROUND, '/obstacles': Label.OBSTACLE}
 """Of a bag that is written."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: options.Subparsers) -> None:
     """Declare the commands."""
     parser = options.command(
         subparsers, 'segment', DESCRIPTION, EXAMPLES,

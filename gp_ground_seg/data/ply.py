@@ -6,8 +6,6 @@ text number by number, which is slow.
 Source: http://paulbourke.net/dataformats/ply/.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

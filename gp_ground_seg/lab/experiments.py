@@ -4,8 +4,6 @@ The docstring of each is its help. What an experiment compares it sets itself, o
 given; scans are labelled frames, or simulated, with exact labels and heights.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple

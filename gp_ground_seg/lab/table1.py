@@ -1,7 +1,5 @@
 """The paper's Table I, measured on segments of labelled frames next to its printed values."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

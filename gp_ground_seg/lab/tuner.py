@@ -3,8 +3,6 @@
 The page is one that viser serves to this user alone.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import html
 import io

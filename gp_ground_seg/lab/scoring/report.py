@@ -1,7 +1,5 @@
 """Results as tables and JSON, and on which machine and with what versions they were made."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform

@@ -6,8 +6,6 @@ so a sequence is drawn as a whole. Six sequences are few: the interval is rough,
 narrow than too wide.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from typing import Any
 

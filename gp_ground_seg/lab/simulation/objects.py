@@ -1,7 +1,5 @@
 """Solids that stand on the terrain or float over it: yawed boxes and upright cylinders."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """Vehicles with bonnets, windscreens and wheels; persons and cyclists."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence
