@@ -255,16 +255,10 @@ def find_left(
 ) -> Sequence[Input]:
     """Return the scans to segment: all with `force`, else those that are not finished.
 
-    Output is finished that is newer than its input, and no older than `PARAMETERS`; of a bag all
-    clouds are done again if one is not. Raises DataError if an output is an input, and without
-    `force` if it was made with other parameters, or by no run with parameters.
-
-    Parameters
-    ----------
-    outputs : sequence of Path
-        The file that each scan becomes, or the one that all of them do.
-    parameters : str or None
-        What a run into a `folder` writes into `PARAMETERS`; None if the output is a single one.
+    Output is finished that is newer than its input, and no older than the `PARAMETERS` of its
+    folder; of a bag all clouds are done again if one is not. `parameters` is None if all scans
+    become one of the `outputs`. Raises DataError if an output is an input, and without `force` if
+    it was made with other parameters, or by no run with parameters.
     """
     sources = [scan.path for scan in scans.files] or [scans.path] * len(outputs)
     taken = {place for path in map(Path.resolve, {*sources}) for place in (path, *path.parents)}

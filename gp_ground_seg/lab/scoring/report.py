@@ -39,7 +39,8 @@ SHARE, SIGNED, COUNT = ('.2f', 100.0), ('+.2f', 100.0), (',.0f',)
 _COUNTED = {
     'n_scans': 'frames', 'points': 'points', 'n_points': 'points', 'n_returns': 'returns',
     'n_objects': 'objects', 'n_lost': 'lost', 'low_things_n': 'low returns',
-    'road_cells_n': 'road cells', 'ground_cells_n': 'ground cells',
+    'road_cells_n': 'road cells', 'ground_cells_n': 'ground cells', 'things': 'objects',
+    'vehicles': 'vehicles', 'lost_vehicles': 'lost', 'persons': 'persons', 'lost_persons': 'lost',
 }  # fmt: skip
 _IN_PERCENT_OR_CM = {
     'precision': 'precision', 'recall': 'recall', 'iou': 'IoU', 'share_ground': 'as ground',
