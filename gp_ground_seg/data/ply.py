@@ -22,8 +22,7 @@ _CODES = {
 _NAMES = {code: name for name, code in _CODES.items()}
 # int8, ..., of newer writers.
 _READABLE = {**_CODES, **{np.dtype(code).name: code for code in (*_NAMES, 'i8', 'u8')}}
-_BIG = 'binary_big_endian'
-_FORMS = 'ascii', 'binary_little_endian', _BIG
+_ORDERS = {'ascii': '<', 'binary_little_endian': '<', 'binary_big_endian': '>'}
 
 
 def read_ply(data: bytes) -> tuple[Fields, list[str]]:
@@ -39,21 +38,20 @@ def read_ply(data: bytes) -> tuple[Fields, list[str]]:
     starts = [k for k, words in enumerate(entries) if words[0] == 'element']
     elements = ', '.join(' '.join(entries[k][1:]) for k in starts)
     vertices = re.match(r'vertex (\d+)(, |$)', elements, re.ASCII)
-    if lines[0].lower() != 'ply' or form not in _FORMS or vertices is None:
+    if lines[0].lower() != 'ply' or form not in _ORDERS or vertices is None:
         raise PointCloudError(
             'no PLY with a number of vertices as its first element: '
             f'format {form}, elements {elements or "none"}'
         )
-    n_points, is_big = int(vertices[1]), form == _BIG
     begin, end = [*starts, len(entries)][:2]
     properties = [words for words in entries[begin:end] if words[0] == 'property']
     read = clouds.read_lines if form == 'ascii' else clouds.read_table
-    fields = read(body, _type_of(properties, is_big), n_points)
+    fields = read(body, _type_of(properties, _ORDERS[form]), int(vertices[1]))
     return fields.astype(fields.dtype.newbyteorder('=')), remarks
 
 
-def _type_of(properties: list[list[str]], is_big: bool) -> np.dtype[Any]:
-    """Type of a vertex, of the lines of its properties."""
+def _type_of(properties: list[list[str]], order: str) -> np.dtype[Any]:
+    """Type of a vertex in a byte order, of the lines of its properties."""
     names, codes = [], []
     for line in properties:
         code = _READABLE.get(line[1].lower()) if len(line) == 3 else None
@@ -61,7 +59,7 @@ def _type_of(properties: list[list[str]], is_big: bool) -> np.dtype[Any]:
             problem = 'cannot be read: a vertex has numbers only, no lists'
             raise PointCloudError(f'line {" ".join(line)!r} of its header {problem}')
         names.append(line[2])
-        codes.append(f'{">" if is_big else "<"}{code}')
+        codes.append(f'{order}{code}')
     return np.dtype(list(zip(clouds.distinct(names), codes, strict=True)))
 
 
