@@ -311,17 +311,19 @@ def _placed(table: DataFrame) -> DataFrame:
 def _scene_table(scores: Scores) -> Table:
     """One row for each sensor and scene: ground, height, objects lost."""
     found = tables.measured(scores.scans, 'sequence')[['iou', 'rmse']]
+    forms = dict[str, Form]()
     for kind, classes in COUNTED.items():
         own = evaluate.sums(scores.objects[scores.objects['class'].isin(classes)], 'sequence')
         own = own.reindex(found.index, fill_value=0)
         found = found.assign(**{kind: own['n_objects'], f'lost_{kind}': own['n_lost']})
+        forms |= {kind: Form(kind, *report.COUNT), f'lost_{kind}': Form('lost', *report.COUNT)}
     table = tables.beside(found, scores).drop(columns='difference')
     title = (
         'IoU of the ground against exact labels [%]; RMSE of the surface [cm]; vehicles, persons '
         'and cyclists, and those lost'
     )
     title += tables.peer_note(scores, ', which gets the true height and place of the sensor')
-    return Table(title, _placed(table))
+    return Table(title, _placed(table), forms)
 
 
 def _low_table(scores: Scores) -> Table:
@@ -333,6 +335,7 @@ def _low_table(scores: Scores) -> Table:
     found = things.join(shares.reindex(columns=[*LOW_CLASSES]))
     title = 'Low objects by height, in plain view 3 to 20 m away, and the share that is lost [%]'
     forms = {name: Form(name.removeprefix('low, '), '.0f', 100.0) for name in LOW_CLASSES}
+    forms['things'] = Form('objects', *report.COUNT)
     return Table(title + tables.peer_note(scores), _placed(tables.beside(found, scores)), forms)
 
 

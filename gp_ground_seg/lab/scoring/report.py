@@ -36,23 +36,29 @@ class Form(NamedTuple):
 
 SHARE, SIGNED, COUNT = ('.2f', 100.0), ('+.2f', 100.0), (',.0f',)
 """Formats and factors: of ratios in percent and metres in cm; of their differences; counts."""
-_COUNTED = {
-    'n_scans': 'frames', 'points': 'points', 'n_points': 'points', 'n_returns': 'returns',
-    'n_objects': 'objects', 'n_lost': 'lost', 'low_things_n': 'low returns',
-    'road_cells_n': 'road cells', 'ground_cells_n': 'ground cells', 'things': 'objects',
-    'vehicles': 'vehicles', 'lost_vehicles': 'lost', 'persons': 'persons', 'lost_persons': 'lost',
-}  # fmt: skip
-_IN_PERCENT_OR_CM = {
-    'precision': 'precision', 'recall': 'recall', 'iou': 'IoU', 'share_ground': 'as ground',
-    'low_things': 'as ground', 'without_model': 'no model', 'bias': 'bias', 'rmse': 'RMSE',
-    'median_absolute': 'median',
-}  # fmt: skip
 FORMS = {
-    **{name: Form(title, *COUNT) for name, title in _COUNTED.items()},
-    **{name: Form(title, *SHARE) for name, title in _IN_PERCENT_OR_CM.items()},
-    **dict.fromkeys(('road_cells', 'ground_cells'), Form('false', '.3f', 100.0)),
+    'n_scans': Form('frames', *COUNT),
+    'points': Form('points', *COUNT),
+    'precision': Form('precision', *SHARE),
+    'recall': Form('recall', *SHARE),
+    'iou': Form('IoU', *SHARE),
     'difference': Form('difference', *SIGNED),
     'interval': Form('95 % interval'),
+    'n_returns': Form('returns', *COUNT),
+    'share_ground': Form('as ground', *SHARE),
+    'n_objects': Form('objects', *COUNT),
+    'n_lost': Form('lost', *COUNT),
+    'low_things_n': Form('low returns', *COUNT),
+    'low_things': Form('as ground', *SHARE),
+    'road_cells_n': Form('road cells', *COUNT),
+    'road_cells': Form('false', '.3f', 100.0),
+    'ground_cells_n': Form('ground cells', *COUNT),
+    'ground_cells': Form('false', '.3f', 100.0),
+    'n_points': Form('points', *COUNT),
+    'without_model': Form('no model', *SHARE),
+    'bias': Form('bias', *SHARE),
+    'rmse': Form('RMSE', *SHARE),
+    'median_absolute': Form('median', *SHARE),
     'within_1': Form('in 1 std', '.1f', 100.0),
     'within_2': Form('in 2 std', '.1f', 100.0),
     'median': Form('median [ms]', '.2f', 1e3),
@@ -200,11 +206,16 @@ def _commit(source: Path) -> str | None:
 
     An installed package may lie inside another repository, whose commit says nothing of it.
     """
-    command = (
-        f'git ls-files --error-unmatch {source.name} >&2 && '
-        "git describe --always --abbrev=40 --dirty '--exclude=*'"
-    )
-    done = subprocess.run(
-        command, shell=True, cwd=source.parent, check=False, capture_output=True, text=True
-    )
-    return done.stdout.strip() or None
+    said = ''
+    for words in (
+        ('ls-files', '--error-unmatch', source.name),
+        ('describe', '--always', '--abbrev=40', '--dirty', '--exclude=*'),
+    ):
+        try:
+            said = subprocess.run(
+                ['git', *words], cwd=source.parent, check=True, capture_output=True, text=True,
+                timeout=10.0,
+            ).stdout.strip()  # fmt: skip
+        except (OSError, subprocess.SubprocessError):
+            return None
+    return said
