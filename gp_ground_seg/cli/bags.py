@@ -1,7 +1,5 @@
 """``kitti-to-bag``: a KITTI sequence as a rosbag2; ``play``: the clouds of a bag, published."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import time
@@ -61,7 +59,7 @@ PLAY_EXAMPLES = """\
 """
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: options.Subparsers) -> None:
     """Declare the commands."""
     options.command(
         subparsers, 'kitti-to-bag', CONVERT_DESCRIPTION, CONVERT_EXAMPLES,

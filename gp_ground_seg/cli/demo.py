@@ -1,7 +1,5 @@
 """``demo``: the node at work, with no data at hand."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time
@@ -51,7 +49,7 @@ exit code: 0, 1 if points were lost, 2 for an error, 130 when interrupted
 """
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: options.Subparsers) -> None:
     """Declare the command."""
     options.command(
         subparsers, 'demo', DESCRIPTION, EXAMPLES,

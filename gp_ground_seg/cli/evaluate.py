@@ -1,7 +1,5 @@
 """``evaluate`` and ``experiment``: measure over labelled or simulated scans, print the tables."""
 
-from __future__ import annotations
-
 import argparse
 import inspect
 import math
@@ -72,7 +70,7 @@ CUT = (
 )  # fmt: skip
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: options.Subparsers) -> None:
     """Declare the commands."""
     peer = 'compare with this method: patchworkpp (pip install pypatchworkpp)'
     options.command(
@@ -84,7 +82,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     _add_experiments(subparsers)
 
 
-def _add_experiments(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_experiments(subparsers: options.Subparsers) -> None:
     """Declare `experiment`, and a command below it for each of `EXPERIMENTS`."""
     description = 'Repeat an experiment of docs/: configurations scored over scans.'
     parser = options.command(subparsers, 'experiment', description, EXPERIMENT_EXAMPLES)
@@ -213,10 +211,10 @@ def _result_lines(scores: evaluate.Scores) -> list[str]:
     medians = scores.scans.groupby('method')['seconds'].median()
     for name in reversed(scores.methods):
         own = pooled.loc[name]
-        words = [] if scores.has_truth else ['no labels of the ground']
+        words = ['no labels of the ground']
         if scores.has_truth:
             titles = {'IoU': 'iou', 'precision': 'precision', 'recall': 'recall'}
-            words += [f'{title} {100.0 * own[key]:.2f} %' for title, key in titles.items()]
+            words = [f'{title} {100.0 * own[key]:.2f} %' for title, key in titles.items()]
         if own.get('n_objects'):
             words.append(f'{own["n_lost"]:.0f} of {own["n_objects"]:.0f} objects lost')
         lines.append(f'{name}: {", ".join(words)}, {1e3 * medians[name]:.1f} ms')

@@ -1,7 +1,5 @@
 """Entry point of ``gp-ground-seg``: commands, and errors mapped to exit codes."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import io
@@ -25,7 +23,7 @@ ROS_ARGS = '--ros-args'
 COMMANDS = {
     'node': ('node', 'run the ROS 2 node'),
     'warm-up': ('node', 'compile the code before the first start'),
-    'config': ('config', 'write and check parameter files'),
+    'config': ('node', 'write and check parameter files'),
     'play': ('bags', "publish a bag's clouds as they were recorded"),
     'demo': ('demo', 'show the node at work, no data needed'),
     'kitti-to-bag': ('bags', 'write a KITTI sequence as a rosbag2'),

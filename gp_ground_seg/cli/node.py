@@ -1,6 +1,4 @@
-"""``node``: the ROS 2 node; ``warm-up``: compile its code beforehand."""
-
-from __future__ import annotations
+"""``node``: the ROS 2 node; ``warm-up``: its compiled code; ``config``: its parameter files."""
 
 import argparse
 import sys
@@ -8,7 +6,10 @@ import time
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core import errors
-from gp_ground_seg.core.errors import GroundSegError
+from gp_ground_seg.core.errors import GroundSegError, shown
+from gp_ground_seg.core.parameters.config import Config, find_preset, parameter_specs
+from gp_ground_seg.core.parameters.schema import FORM_OF_ROS, is_ours, nodes_of, read_yaml
+from gp_ground_seg.ros.arguments import objections_of_ros
 from gp_ground_seg.ros.node_process import run_node
 
 NODE_EXAMPLES = """\
@@ -25,9 +26,21 @@ WARM_UP_EXAMPLES = """\
   gp-ground-seg warm-up
   NUMBA_CACHE_DIR=/opt/robot/numba gp-ground-seg warm-up
 """
+CONFIG_EXAMPLES = """\
+  gp-ground-seg config dump > my.yaml        every parameter, explained
+  gp-ground-seg config dump --config my.yaml --set label.ground_tolerance=0.15
+  gp-ground-seg config dump --preset paper   those of the paper, with reasons
+  gp-ground-seg config check my.yaml         unknown names, types, ranges
+"""
+DUMP = 'print the effective parameters as a ROS parameter file'
+CHECK_DESCRIPTION = """\
+Check names, types, ranges and the rules between parameters, and say who reads the
+file: commands read bare groups too, the node only the form of ROS (/**:
+ros__parameters:). Exit code 2 if anything is wrong.
+"""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: options.Subparsers) -> None:
     """Declare the commands; what follows ``--ros-args`` is left to ROS or the node."""
     description = 'Run the ROS 2 node: points in, ground and obstacles out.'
     parser = options.command(
@@ -36,6 +49,17 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )  # fmt: skip
     parser.usage = 'gp-ground-seg node [--ros-args ...]'
     options.command(subparsers, 'warm-up', WARM_UP_DESCRIPTION, WARM_UP_EXAMPLES, run=run_warm_up)
+    description = 'Show the parameters, their units and ranges.'
+    parser = options.command(subparsers, 'config', description, CONFIG_EXAMPLES)
+    commands = parser.add_subparsers(metavar='WHAT', required=True)
+    options.command(
+        commands, 'dump', DUMP, CONFIG_EXAMPLES, *options.CONFIG, purpose=DUMP, run=run_dump
+    )
+    files = 'files', 'parameter file (YAML)', {'metavar': 'FILE', 'nargs': '+'}
+    options.command(
+        commands, 'check', CHECK_DESCRIPTION, CONFIG_EXAMPLES, files,
+        purpose='say everything that is wrong with a parameter file', run=run_check,
+    )  # fmt: skip
 
 
 def main(*, is_managed: bool = False) -> int:
@@ -43,7 +67,7 @@ def main(*, is_managed: bool = False) -> int:
     try:
         return run_node(sys.argv[1:], is_managed=is_managed)
     except GroundSegError as error:
-        print(f'ground_segmentation_node: error: {errors.shown(error)}', file=sys.stderr)
+        print(f'ground_segmentation_node: error: {shown(error)}', file=sys.stderr)
         return 2
 
 
@@ -69,3 +93,31 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
         raise GroundSegError('compiled code is not kept on disk, see the note above')
     print(f'compiled code is kept in {folder}; it was there after {seconds:.1f} s')
     return 0
+
+
+def run_dump(arguments: argparse.Namespace) -> int:
+    """Print the parameters as YAML, with the preset's reasons for the values it has given."""
+    config = options.read_config(arguments)
+    print(find_preset(arguments.preset).to_yaml(config), end='')
+    return 0
+
+
+def run_check(arguments: argparse.Namespace) -> int:
+    """Print the problems of each file, or how much it gives and changes."""
+    code = 0
+    for path in arguments.files:
+        problems = Config.problems_of_file(path)
+        nodes = [] if problems else nodes_of(read_yaml(path))
+        if any(node for node, _ in nodes):
+            problems = objections_of_ros(path)
+        for problem in problems:
+            code = 2
+            print(shown(f'{path}: {problem}'), file=sys.stderr)
+        for node, values in [] if problems else nodes:
+            n_changed = len(Config().differences(Config().replace(**values)))
+            given = f'{len(values)} of {len(parameter_specs())} parameters given'
+            use = '' if node else f' for --config, but not in the form of ROS that {FORM_OF_ROS}'
+            if '/' in node.strip('/') or not is_ours(node):
+                use = f' for a node named {shown(node)} only'
+            print(f'{shown(path)}: good{use}; {given}, {n_changed} unlike the default')
+    return code

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from tqdm import tqdm
 
@@ -26,6 +26,7 @@ COMPILING_PAYS = 300  # scans
 WIDTH = 79  # of the texts of help
 LINE_PERIOD = 30.0  # time between lines of progress where there is no terminal [s]
 BAR = '{desc} |{bar}| {n_fmt} of {total_fmt} frames done, {remaining} left'
+Subparsers: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 Option = tuple[str, str, dict[str, Any]]
 """Names of an option, its help, and what else `add_argument` takes."""
 FLAG = {'action': 'store_true'}
@@ -36,7 +37,7 @@ TO_JSON = ('--json', 'write every number to this file as well', {'metavar': 'FIL
 
 
 def command(
-    subparsers: argparse._SubParsersAction[argparse.ArgumentParser],
+    subparsers: Subparsers,
     name: str,
     description: str,
     examples: str,

@@ -1,7 +1,5 @@
 """``plot``: pictures of a segmented scan: in perspective, or segments of it from the side."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
@@ -23,11 +21,10 @@ SCAN_EXAMPLES = """\
   gp-ground-seg plot scan 000000.bin --labels 000000.label -o errors.png
 """
 SEGMENT = """\
-The paper's Figure 1 for any scan and segment, or two side by side: points, ground
-candidates, the lines through them with their critical points, the inliers, and the
-estimated ground with twice its standard deviation; below it the length-scale and its
-pseudo-inputs. Of n segments number m begins at azimuth -180 + m * 360/n degrees,
-counter-clockwise from ahead: 90 of 180 is ahead, to the left.
+The paper's Figure 1 for any scan and segment, or two side by side: points, ground candidates, the
+lines through them with their critical points, the inliers, and the estimated ground with twice its
+standard deviation; below it the length-scale and its pseudo-inputs. Of n segments number m begins
+at azimuth -180 + m * 360/n degrees, counter-clockwise from ahead: 90 of 180 is ahead, to the left.
 """
 SEGMENT_EXAMPLES = """\
   gp-ground-seg plot segment 000000.bin --segment 90 -o ahead.pdf
@@ -37,7 +34,7 @@ KINDS = ('.png', '.pdf', '.svg')
 ENDINGS = ' or '.join(KINDS)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: options.Subparsers) -> None:
     """Declare the command and its pictures."""
     description = 'Draw a segmented scan: in perspective, or one segment of it.'
     examples = SCAN_EXAMPLES + SEGMENT_EXAMPLES

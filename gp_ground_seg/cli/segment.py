@@ -1,36 +1,41 @@
-"""``segment``: label scans, or split the clouds of a bag."""
+"""``segment``: label scans, or split the clouds of a bag; what was done before is skipped."""
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import os
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 from gp_ground_seg import __version__
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
+from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
+from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data import bags, files, inputs, semantic_kitti
-from gp_ground_seg.data.cloud_files import FORMATS, LABELS
-from gp_ground_seg.data.inputs import Inputs
-from gp_ground_seg.lab import dataset
+from gp_ground_seg.data.cloud_files import FORMATS, LABELS, encode_output, format_for
+from gp_ground_seg.data.inputs import Input, Inputs
+from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
+from gp_ground_seg.lab.cluster import Progress
 
 DESCRIPTION = """\
 Split scans into ground and obstacles.
 
-INPUT is a scan (.bin .pcd .ply .npy .npz), a folder or sequence of scans, a bag
-(.bag .mcap .db3, or a rosbag2 folder), or a KITTI_ROOT. docs/datasets.md has more
-on formats, and on whole data sets.
+INPUT is a scan (.bin .pcd .ply .npy .npz), a folder or sequence of scans, a bag (.bag .mcap .db3,
+or a rosbag2 folder), or a KITTI_ROOT. docs/datasets.md has more on formats, and on whole data
+sets.
 
-A .bin gives a .label file: 40 = ground, 99 = obstacle, 0 = no return (SemanticKITTI).
-Other scans keep their format and get label (1 ground, 2 obstacle, 0 no return), height,
-ground_z, ground_std and p_ground. A bag gives a rosbag2 of the ground and the obstacles of each
-cloud.
+A .bin gives a .label file: 40 = ground, 99 = obstacle, 0 = no return (SemanticKITTI). Other scans
+keep their format and get label (1 ground, 2 obstacle, 0 no return), height, ground_z, ground_std
+and p_ground. A bag gives a rosbag2 of the ground and the obstacles of each cloud.
 
 If it is run again with the same arguments, inputs whose output is newer are skipped.
 
@@ -44,9 +49,13 @@ EXAMPLES = """\
   gp-ground-seg segment KITTI_ROOT -o OUT --workers 8
   gp-ground-seg segment KITTI_ROOT -o OUT --scheduler tcp://host:8786
 """
+PARAMETERS = 'parameters.yaml'
+"""File of an output folder that says how its files were made."""
+TOPICS = {'/ground': Label.GROUND, '/obstacles': Label.OBSTACLE}
+"""Of a bag that is written."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: options.Subparsers) -> None:
     """Declare the commands."""
     parser = options.command(
         subparsers, 'segment', DESCRIPTION, EXAMPLES,
@@ -78,22 +87,22 @@ def run(arguments: argparse.Namespace) -> int:
     folder, place = (target.parent, target) if is_one else (target, target.resolve())
     if not place.parent.is_dir():
         raise DataError(f'{target}: the folder {place.parent} does not exist')
-    outputs = [target] if is_one else [dataset.output_of(folder, form, scan) for scan in scans]
+    outputs = [target] if is_one else [output_of(folder, form, scan) for scan in scans]
     parameters = None if is_one else _parameters(arguments, config)
-    left = dataset.find_left(scans, outputs, folder, parameters, force=arguments.force)
+    left = find_left(scans, outputs, folder, parameters, force=arguments.force)
     if len(left) < len(scans):
         print(f'{len(scans) - len(left)} of {len(scans)} were finished before')
     if not left:
         return 0
     used = options.spare_compiling(config, len(left))
-    write = partial(dataset.segment_scans, folder, form, used)
+    write = partial(segment_scans, folder, form, used)
     if is_one and scans.topic:
-        write = partial(dataset.segment_bag, target, used)
+        write = partial(segment_bag, target, used)
     with options.runner(arguments, 'segment') as runner:
-        if parameters and (arguments.force or dataset.find_difference(folder, parameters)):
-            files.write_file(folder / dataset.PARAMETERS, parameters.encode())
+        if parameters and (arguments.force or find_difference(folder, parameters)):
+            files.write_file(folder / PARAMETERS, parameters.encode())
         found = runner.run(write, left)
-    _print_summary([*chain(*found)], target, runner.n_workers)
+    _print_summary([*itertools.chain(*found)], target, runner.n_workers)
     options.note_spared(config, used)
     return 0
 
@@ -148,7 +157,7 @@ def _default_output(source: Path, form: str | None = None) -> Path:
     return named.with_name(f'{named.stem}_ground{suffix}')
 
 
-def _print_summary(found: Sequence[dataset.Outcome], target: Path, n_workers: int = 0) -> None:
+def _print_summary(found: Sequence[Outcome], target: Path, n_workers: int = 0) -> None:
     """Print points, ground, time, and height and tilt of the sensor."""
     seconds = [one.seconds for one in found]
     n_points, n_ground = sum(one.n_points for one in found), sum(one.n_ground for one in found)
@@ -183,3 +192,101 @@ def _pose_summary(poses: Sequence[MeasuredPose]) -> str:
         spread = f' (std {statistics.stdev(values):.{digits}f})' if len(values) > 1 else ''
         words.append(f'sensor.{name}={statistics.median(values):.{digits}f}{spread} {unit}')
     return f'measured in {options.count(len(heights), "frame")}: {", ".join(words)}'
+
+
+class Outcome(NamedTuple):
+    """What is kept of a segmented cloud, for a summary."""
+
+    n_points: int
+    n_ground: int
+    seconds: float  # segmentation only
+    measured: MeasuredPose | None  # what it shows of the sensor's pose
+    contradictions: Sequence[str]  # of it and a parameter
+
+    @classmethod
+    def of(cls, result: Segmentation) -> Outcome:
+        """Count a result."""
+        pose, n_ground = result.pose, int(result.is_ground.sum())
+        seconds, n_points = result.timings['total'], len(result.label)
+        return cls(n_points, n_ground, seconds, pose.measured, pose.contradictions)
+
+
+def output_of(folder: Path, form: str | None, scan: Input) -> Path:
+    """File of a folder that a scan becomes, of a format or by default of its own."""
+    return folder / f'{scan.name}.{format_for(scan.path, form)}'
+
+
+def segment_scans(
+    folder: Path, form: str | None, config: Config, scans: Iterable[Input], progress: Progress
+) -> list[Outcome]:
+    """Write the file of each scan into a folder, replacing others."""
+    segmenter, found = GroundSegmenter(config), []
+    for scan in progress(scans):
+        cloud, path = scan.read(), output_of(folder, form, scan)
+        with files.naming(scan.path):
+            result = segmenter.segment(cloud.xyz)
+        files.write_file(path, encode_output(path, cloud, result))
+        found.append(Outcome.of(result))
+    return found
+
+
+def segment_bag(target: Path, config: Config, bag: Inputs, progress: Progress) -> list[Outcome]:
+    """Write a bag of the ground and the obstacles of each cloud of a bag, replacing another.
+
+    It is stored as its suffix says, else as the input. Raises DataError if a cloud cannot be read,
+    or the bag cannot be written.
+    """
+    storage = bags.storage_of(bag.path).replace('ros1', 'mcap')  # no ROS 1 bag is written
+    topics = dict.fromkeys(TOPICS, bags.POINT_CLOUD2)
+    segmenter, found = GroundSegmenter(config), []
+    with bags.new_bag(target, topics, force=True, storage=storage) as write:
+        for place, time, raw in progress(bag.messages()):
+            with files.naming(place):
+                cloud = bags.decode_cloud(raw)
+                result = segmenter.segment(read_xyz(cloud))
+            for part, label in TOPICS.items():
+                write(part, time, bags.encode_cloud(select_points(cloud, result.label == label)))
+            found.append(Outcome.of(result))
+    return found
+
+
+def find_left(
+    scans: Inputs, outputs: Sequence[Path], folder: Path, parameters: str | None, *, force: bool
+) -> Sequence[Input]:
+    """Return the scans to segment: all with `force`, else those that are not finished.
+
+    Output is finished that is newer than its input, and no older than the `PARAMETERS` of its
+    folder; of a bag all clouds are done again if one is not. `parameters` is None if all scans
+    become one of the `outputs`. Raises DataError if an output is an input, and without `force` if
+    it was made with other parameters, or by no run with parameters.
+    """
+    sources = [scan.path for scan in scans.files] or [scans.path] * len(outputs)
+    taken = {place for path in map(Path.resolve, {*sources}) for place in (path, *path.parents)}
+    for path in outputs:
+        if path.resolve() in taken:
+            raise DataError(f'{path}: is the input, or has it in it; name another output')
+    if parameters is not None:
+        for parent in {path.parent for path in outputs}:
+            files.remove_leftovers(parent)
+    there = [path for path in outputs if os.path.lexists(path)]
+    if force or not there:
+        return scans if scans.topic else scans.files
+    begun = files.changed_at(folder / PARAMETERS)
+    if parameters is None or not begun:
+        raise DataError(f'{there[0]}: exists already; --force replaces it')
+    if said := find_difference(folder, parameters):
+        raise DataError(f'{said}; give another output folder, or --force to start anew')
+    is_left = [
+        files.changed_at(path) <= files.changed_at(source) or files.changed_at(path) < begun
+        for source, path in zip(sources, outputs, strict=True)
+    ]
+    return scans if scans.topic and any(is_left) else [*itertools.compress(scans.files, is_left)]
+
+
+def find_difference(folder: Path, parameters: str) -> str:
+    """Say where the `PARAMETERS` of a folder differ from these; empty if they do not."""
+    path = folder / PARAMETERS
+    before = files.read_bytes(path, 1 << 20).decode(errors='replace') if path.exists() else ''
+    lines = itertools.zip_longest(before.splitlines(), parameters.splitlines(), fillvalue='')
+    found = (f'{path}: says "{said}", now it is "{now}"' for said, now in lines if said != now)
+    return next(found, '')

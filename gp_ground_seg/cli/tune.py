@@ -1,7 +1,5 @@
 """``tune``: parameters by sliders, and the labels of a scan next to them."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 from pathlib import Path
@@ -27,7 +25,7 @@ needs the package viser (docs/install.md)
 """
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: options.Subparsers) -> None:
     """Declare the command."""
     file, specs = {'metavar': 'FILE'}, tunable()
     basic = [spec.name for spec in specs if spec.basic]

@@ -1,7 +1,5 @@
 """Compute backends: the stages of a frame in plain numpy, or compiled with numba."""
 
-from __future__ import annotations
-
 import logging
 from typing import TYPE_CHECKING, TypeAlias
 

@@ -1,7 +1,5 @@
 """What the user is told: errors of one clear line, and messages of the library."""
 
-from __future__ import annotations
-
 import importlib
 import logging
 import shlex

@@ -109,14 +109,12 @@ class Tiles(NamedTuple):
         padded[1:-1, 1:-1] = self.at.reshape(width - 2, width - 2)
         steps = (np.arange(3)[:, None] * width + np.arange(3)).ravel()
         place = as_index(self.place)
-        result: CellArray = padded.ravel()[(place + 2 * (place // self.n_sides))[:, None] + steps]
-        return result
+        return np.asarray(padded.ravel()[(place + 2 * (place // self.n_sides))[:, None] + steps])
 
     @property
     def lowest_z(self) -> PointArray:
         """Height of the lowest point of each tile, (T,) [m]."""
-        value: PointArray = self.extremes[:, 0]
-        return value
+        return np.asarray(self.extremes[:, 0])
 
 
 class Candidates(NamedTuple):
@@ -147,11 +145,8 @@ class Candidates(NamedTuple):
         first, stop = self.offsets[:-1], self.offsets[1:]
         if len(self.bin) == 0:
             return np.zeros(len(stop), dtype=np.int64)
-        # The index wraps around in leading segments without a candidate; they get 0 below.
-        result: IntArray = self.bin[stop - 1]
-        result += 2
-        result *= stop > first
-        return result
+        # The index wraps around in leading segments without a candidate.
+        return np.where(stop > first, self.bin[stop - 1] + 2, 0)
 
     @classmethod
     def buffers(cls, n: int, n_segments: int) -> Candidates:

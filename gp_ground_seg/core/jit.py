@@ -6,8 +6,6 @@ file that begins with its checksum: what is damaged, as after a power cut, is co
 several processes one compiles a function, and the others wait for its file.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import functools

@@ -161,8 +161,7 @@ class Segmentation:
     def is_ground(self) -> BoolArray:
         """Whether each point is GROUND, (N,)."""
         # Comparing with an enumeration is five times slower.
-        is_ground: BoolArray = self.label == int(Label.GROUND)
-        return is_ground
+        return np.asarray(self.label == int(Label.GROUND))
 
     def __repr__(self) -> str:
         """One line: a scan has too many numbers to print."""

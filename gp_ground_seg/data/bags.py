@@ -7,8 +7,6 @@ rosbags for single MCAP files: a channel of protobuf or JSON, or no profile, sto
 (test/foreign_files.py).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import os

@@ -159,18 +159,13 @@ def split_header(data: bytes, last: str) -> tuple[list[str], bytes]:
     return [line for line in lines if line], data[found.end() :]
 
 
-def check_size(n_bytes: int, n_points: int, needed: int) -> None:
-    """Raise PointCloudError if the points need more bytes than are there."""
-    if needed > n_bytes:
-        raise PointCloudError(
-            f'{n_bytes} bytes behind the header, which says {n_points} points '
-            f'(at least {needed} bytes); truncated?'
-        )
-
-
 def read_table(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
     """Read the points behind a header; PointCloudError if there are fewer than it says."""
-    check_size(len(data), n_points, n_points * dtype.itemsize)
+    if (needed := n_points * dtype.itemsize) > len(data):
+        raise PointCloudError(
+            f'{len(data)} bytes behind the header, which says {n_points} points '
+            f'(at least {needed} bytes); truncated?'
+        )
     return np.frombuffer(data, dtype, n_points)
 
 

@@ -4,8 +4,6 @@ Output never replaces what the user has not agreed to. It is flushed to disk, wi
 it is in, before it counts as written: a power failure leaves no empty file under its name.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import glob

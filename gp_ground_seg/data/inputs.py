@@ -1,7 +1,5 @@
 """Clouds of an input: a file of any format, a folder of files, a data set, a bag."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence

@@ -7,8 +7,6 @@ codec lzf.
 Source: https://pointclouds.org/documentation/tutorials/pcd_file_format.html, pcl/io/pcd_io.cpp.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from typing import Any, NamedTuple

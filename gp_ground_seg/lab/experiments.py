@@ -4,8 +4,6 @@ The docstring of each is its help. What an experiment compares it sets itself, o
 given; scans are labelled frames, or simulated, with exact labels and heights.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -229,14 +227,12 @@ def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner =
         f'{n:g}': config.replace(**ALL_LEARNED, **{name: n}) for n in CANDIDATES_PER_PSEUDO_INPUT
     }
     scores, table = score_variants(items, variants, [], runner)
-    n_inputs = scores.scans['n_pseudo_inputs'] / scores.scans['n_segments']
-    scans = scores.scans.assign(n_inputs=n_inputs).groupby('method', sort=False, as_index=False)
-    pairs = [(name, scores.methods[0]) for name in scores.methods]
-    table = table[['method', 'iou', 'rmse']].assign(
+    pairs = [(own, scores.methods[0]) for own in scores.methods]
+    table = table.assign(
         interval=_differences(scores, 'rmse', pairs)['interval'],
-        n_pseudo_inputs=scans['n_inputs'].mean()['n_inputs'],
-        median=scans['seconds'].median()['seconds'],
-    )
+        n_pseudo_inputs=table['n_pseudo_inputs'] / table['n_segments'],
+        median=scores.scans.groupby('method', sort=False)['seconds'].median().to_numpy(),
+    )[['method', 'iou', 'rmse', 'interval', 'n_pseudo_inputs', 'median']]
     title = (
         f'{_counted(scores)}; candidates of a line for each pseudo-input; interval of the RMSE '
         f'minus that of the first row; n_L: pseudo-inputs of a segment, mean; time of a frame; '

@@ -6,8 +6,6 @@ This is the only module that imports matplotlib. A function that draws raises
 `MissingDependencyError` if it is not installed, and `DataError` if the file cannot be written.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The paper's Table I, measured on segments of labelled frames next to its printed values."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,8 +15,6 @@ from gp_ground_seg.lab.scoring.report import COUNT, Form, Report, Table, frame_o
 
 COMPARED = {'Z-L': 'latent', 'Z': 'line_gradient'}
 """The paper's method and the one it is compared with, as values of ``length_scale.model``."""
-LEARNED = {'learning.fixed': 'none'}
-"""As in the paper, which learns all length-scales too."""
 CHOICES = {('10', '000000'): (157, 158), ('03', '000006'): (147, 148)}
 """Segments by sequence and frame: an adjacent pair that climbs a verge and a hill, 3 m over 30 m,
 and one on uneven ground."""
@@ -56,8 +52,9 @@ def table1(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Rep
         raise DataError(f'no frame {index} in sequence {sequence}')
     rows: list[dict[str, Any]] = []
     for by, own in {'ours': config, 'preset': find_preset('paper').config}.items():
+        # As in the paper, all length-scales are learned too.
         methods = [
-            OurMethod(own.replace(**LEARNED, **{'length_scale.model': model}), name)
+            OurMethod(own.replace(**{'length_scale.model': model, 'learning.fixed': 'none'}), name)
             for name, model in COMPARED.items()
         ]
         for choice, segments in CHOICES.items():

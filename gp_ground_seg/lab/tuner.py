@@ -3,8 +3,6 @@
 The page is one that viser serves to this user alone.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import html
 import io
@@ -182,9 +180,7 @@ def slider_range(spec: ParameterSpec, now: Any) -> tuple[Any, Any, Any]:
     The values are those that people use, not all that are accepted: a fifth to five times the
     default, and `now`.
     """
-    least, greatest = spec.minimum, spec.maximum
-    assert least is not None and greatest is not None
-    low, high = _USUAL.get(spec.name, (least, greatest))
+    low, high = _USUAL.get(spec.name, (spec.minimum, spec.maximum))
     if spec.name not in _USUAL and spec.default != AUTO and float(spec.default) > 0.0:
         low, high = max(low, 0.2 * float(spec.default)), min(high, 5.0 * float(spec.default))
     numbers = [low, high, *(float(value) for value in (spec.default, now) if value != AUTO)]
@@ -341,8 +337,8 @@ def _table(result: Segmentation, before: Labels, sums: Sequence[dict[str, Any]])
         rows['IoU'] = [f'{100.0 * label_ratios(own)["iou"]:.2f} %' for own in sums]
         rows['objects lost'] = [f'{own["n_lost"]} of {own["n_objects"]}' for own in sums]
     rows['time'] = [f'{1e3 * result.timings["total"]:.0f} ms', '']
-    is_ground = (result.label == Label.GROUND)[result.label != before]
-    numbers = len(is_ground), int(is_ground.sum()), int((~is_ground).sum())
+    is_ground = result.is_ground[result.label != before]
+    numbers = is_ground.size, is_ground.sum(), (~is_ground).sum()
     n_changed, n_ground, n_obstacle = map(errors.in_thousands, numbers)
     return '\n'.join(
         ['| | now | before |', '|---|--:|--:|',

@@ -66,12 +66,9 @@ def test_what_is_needed_is_read_of_every_file_or_the_reason_said(tmp_path, name)
 def test_what_is_left_out_is_told_once(tmp_path, caplog):
     caplog.set_level('INFO', 'gp_ground_seg')
     errors._logged.clear()
-    for name in ('list_last.ply', 'list_last_text.ply', 'list_last_big.ply', 'nan_as_integer.pcd'):
+    for name in ['nan_as_integer.pcd'] * 2:
         decode_file(tmp_path / name, CASES[name][0])
-    assert caplog.messages == [
-        'PLY: lists of the vertices are left out: views, w',
-        'field ring: has numbers that are no uint16; read as float64',
-    ]
+    assert caplog.messages == ['field ring: has numbers that are no uint16; read as float64']
 
 
 @pytest.fixture(scope='module')

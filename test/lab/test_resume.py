@@ -9,7 +9,7 @@ from evaluation_samples import label_files, write_streets
 
 from gp_ground_seg import __version__
 from gp_ground_seg.cli import segment as command
-from gp_ground_seg.lab.dataset import PARAMETERS
+from gp_ground_seg.cli.segment import PARAMETERS
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from gp_ground_seg.lab.simulation import DRIVES, SCENES, Kind
 from gp_ground_seg.lab.simulation import terrain as landforms
-from gp_ground_seg.lab.simulation.objects import Box, Cylinder, nearest_solid
+from gp_ground_seg.lab.simulation.objects import Cylinder, Hull, nearest_solid, standing_box
 from gp_ground_seg.lab.simulation.terrain import first_hit, polyline
 
 SENSOR_POSITION = np.array([0.0, 0.0, 1.73])
@@ -106,10 +107,9 @@ def test_landform_heights(terrain, u, expected):
 def inside(solid, points):
     """Obvious twin of `Solid.entry`: whether points lie in the solid."""
     x, y = points[..., 0] - solid.x, points[..., 1] - solid.y
-    if isinstance(solid, Box):
-        u = x * math.cos(solid.yaw) + y * math.sin(solid.yaw)
-        v = y * math.cos(solid.yaw) - x * math.sin(solid.yaw)
-        outline = (np.abs(u) <= solid.length / 2) & (np.abs(v) <= solid.width / 2)
+    if isinstance(solid, Hull):
+        planes = zip(solid.normals, solid.limits, strict=True)
+        outline = np.all([x * u + y * v <= limit for (u, v, _), limit in planes], axis=0)
     else:
         outline = np.hypot(x, y) <= solid.radius
     return outline & (points[..., 2] >= solid.bottom) & (points[..., 2] <= solid.top)
@@ -122,8 +122,8 @@ def draw_solid(draw):
     length, width, yaw = (draw(st.floats(*ends)) for ends in ((0.3, 8), (0.3, 3), (-4, 4)))
     if draw(st.booleans()):
         return Cylinder(Kind.POLE, x, y, bottom, bottom + height, width)
-    radius = 0.5 * math.hypot(length, width)
-    return Box(Kind.BOX, x, y, bottom, bottom + height, radius, length, width, yaw)
+    box = standing_box(landforms.flat(), x, y, (length, width, height), yaw)
+    return replace(box, bottom=bottom, top=bottom + height)
 
 
 @given(
@@ -150,7 +150,7 @@ def test_entry_is_where_the_inside_begins_and_no_ray_through_the_middle_misses(s
 
 
 def test_axis_parallel_rays_and_starts_inside():
-    box = Box(Kind.BOX, 5.0, 0.0, -1.0, 1.0, math.sqrt(2.0), 2.0, 2.0, 0.0)
+    box = standing_box(landforms.flat(), 5.0, 0.0, (2.0, 2.0, 1.0))
     origin = np.array([[0.0, 0.0, 0.0], [0.0, 1.5, 0.0], [5.0, 0.0, 0.0], [5.0, 0.0, 4.0]])
     direction = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     np.testing.assert_allclose(box.entry(origin, direction), [4.0, np.inf, np.inf, 3.0])

@@ -4,8 +4,6 @@ Sums add up over scans. A measure is a function of sums by name: of a mapping of
 frame of pandas, whose rows are scans or groups of them. Ratios over nothing are NaN.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

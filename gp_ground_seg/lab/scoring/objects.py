@@ -7,8 +7,6 @@ Two more measures are of what a robot meets: **low things**, labelled objects of
 part is cut off, and **false cells**, ground that a costmap takes for an obstacle.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Results as tables and JSON, and on which machine and with what versions they were made."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform
@@ -121,10 +119,7 @@ def require_pandas() -> Any:
 
 def records(frame: DataFrame) -> list[dict[str, Any]]:
     """Return the rows with values of Python, None for NaN."""
-    found: list[dict[str, Any]] = (
-        frame.astype(object).where(frame.notna(), None).to_dict('records')
-    )
-    return found
+    return list(frame.astype(object).where(frame.notna(), None).to_dict('records'))
 
 
 class Report(NamedTuple):

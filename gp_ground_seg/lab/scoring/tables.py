@@ -6,8 +6,6 @@ so a sequence is drawn as a whole. Six sequences are few: the interval is rough,
 narrow than too wide.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from typing import Any
 
@@ -64,8 +62,7 @@ def clusters(scores: Scores) -> DataFrame:
         return found
     n = len(found)
     n_blocks = max(min(N_BLOCKS, n // MIN_BLOCK), 1)
-    ends = [n * k // n_blocks for k in range(1, n_blocks)]
-    return found.assign(cluster=np.searchsorted(ends, np.arange(n), side='right'))
+    return found.assign(cluster=((np.arange(n) + 1) * n_blocks - 1) // n)
 
 
 def interval_text(
@@ -163,32 +160,26 @@ def evaluation(scores: Scores, config: Config) -> Report:
     Scans without labels have tables of time and of differing labels only. A further measure of
     labelled scans is a column here.
     """
-    tables: dict[str, Table] = {}
-    if scores.has_truth:
-        tables['groundgrid'] = _grouped(
-            scores, 'GroundGrid convention: vegetation left out [%]',
-            scores.scans, 'sequence', ['n_scans', *metrics.LABEL_MEASURES],
-        )  # fmt: skip
-        tables['low_things'] = _grouped(
-            scores, 'Low objects and false cells [%]', scores.scans, 'sequence',
-            [column for name in objects.SHARES for column in (f'{name}_n', name)],
-        )  # fmt: skip
-        tables['heights'] = _grouped(
-            scores, 'Height of the ground under returns labelled ground [cm]; shares without a '
-            'model and within one and two standard deviations [%]',
-            scores.scans, 'sequence', ['n_points', *HEIGHTS],
-        )  # fmt: skip
-        minus = f' minus that of {scores.peer}' if scores.peer else ''
-        tables['rings'] = _grouped(
-            scores, f'IoU{minus} by horizontal range (GroundGrid convention) [%]',
-            scores.rings, 'range', [*metrics.LABEL_MEASURES], 'iou',
-        )  # fmt: skip
-    if len(scores.objects):
-        tables['objects'] = _grouped(
-            scores, 'Objects: returns on them, and the share called ground [%]; objects, and '
-            'those lost', scores.objects, 'class',
-            ['n_returns', 'share_ground', 'n_objects', 'n_lost'], 'share_ground',
-        )  # fmt: skip
+    minus = f' minus that of {scores.peer}' if scores.peer else ''
+    layouts: tuple[tuple[Any, ...], ...] = (
+        ('groundgrid', 'GroundGrid convention: vegetation left out [%]',
+         scores.scans, 'sequence', ['n_scans', *metrics.LABEL_MEASURES]),
+        ('low_things', 'Low objects and false cells [%]', scores.scans, 'sequence',
+         [column for name in objects.SHARES for column in (f'{name}_n', name)]),
+        ('heights', 'Height of the ground under returns labelled ground [cm]; shares without a '
+         'model and within one and two standard deviations [%]',
+         scores.scans, 'sequence', ['n_points', *HEIGHTS]),
+        ('rings', f'IoU{minus} by horizontal range (GroundGrid convention) [%]',
+         scores.rings, 'range', [*metrics.LABEL_MEASURES], 'iou'),
+        ('objects', 'Objects: returns on them, and the share called ground [%]; objects, and '
+         'those lost', scores.objects, 'class',
+         ['n_returns', 'share_ground', 'n_objects', 'n_lost'], 'share_ground'),
+    )  # fmt: skip
+    tables = {
+        name: _grouped(scores, title, frame, *more)
+        for name, title, frame, *more in layouts
+        if scores.has_truth and len(frame)
+    }
     if scores.peer:
         tables['measures'] = difference_table(scores)
     return make_report({**tables, **time_tables(scores, scores.peer)}, scores, config)

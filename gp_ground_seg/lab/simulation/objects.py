@@ -1,7 +1,5 @@
 """Solids that stand on the terrain or float over it: yawed boxes and upright cylinders."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
@@ -70,19 +68,20 @@ class Solid(ABC):
         return np.where((enter <= leave) & (enter > 0.0), enter, np.inf)
 
 
-@dataclass(frozen=True)
-class Box(Solid):
-    """Upright box of a length, a width [m] and a yaw [rad]."""
+@dataclass(frozen=True, eq=False)
+class Hull(Solid):
+    """Convex solid between planes: all p with ``normal . (p - (x, y, 0)) <= limit``."""
 
-    length: float
-    width: float
-    yaw: float
+    normals: FloatArray  # (K, 3), outward
+    limits: FloatArray  # (K,) [m]
 
     def _outline(self, offset: FloatArray, rate: FloatArray) -> list[Interval]:
-        xy, rate = offset[:, :2], rate[:, :2]
-        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
-        sides = (np.array([cos, sin]), self.length), (np.array([-sin, cos]), self.width)
-        return [slab(-0.5 * size, 0.5 * size, xy @ axis, rate @ axis) for axis, size in sides]
+        outward = self.normals @ rate.T
+        outward[np.abs(outward) < SMALLEST_RATE] = SMALLEST_RATE
+        at = (self.limits[:, None] - self.normals @ offset.T) / outward
+        leaves = outward > 0.0
+        enter, leave = np.where(leaves, -np.inf, at), np.where(leaves, at, np.inf)
+        return [(enter.max(axis=0), leave.min(axis=0))]
 
 
 @dataclass(frozen=True)
@@ -171,16 +170,19 @@ def _find_towards(solid: Solid, origin: FloatArray, azimuth: FloatArray) -> IntA
 
 def standing_box(
     terrain: Terrain, x: float, y: float, size: Size, yaw: float = 0.0, kind: Kind = Kind.BOX
-) -> Box:
+) -> Hull:
     """Box that stands on the terrain."""
     length, width, height = size
     ground, radius = float(terrain.height(x, y)), 0.5 * math.hypot(length, width)
-    return Box(kind, x, y, ground - BURIED_DEPTH, ground + height, radius, length, width, yaw)
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    sides = np.array([[cos, sin, 0.0], [-cos, -sin, 0.0], [-sin, cos, 0.0], [sin, -cos, 0.0]])
+    limits = 0.5 * np.array([length, length, width, width])
+    return Hull(kind, x, y, ground - BURIED_DEPTH, ground + height, radius, sides, limits)
 
 
 def floating_box(
     terrain: Terrain, x: float, y: float, size: Size, clearance: float, kind: Kind = Kind.OVERHANG
-) -> Box:
+) -> Hull:
     """Box that floats `clearance` [m] over the terrain."""
     bottom = float(terrain.height(x, y)) + clearance
     box = standing_box(terrain, x, y, size, kind=kind)
@@ -224,7 +226,7 @@ def truck(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Solid
 
 def wall(
     terrain: Terrain, start: tuple[float, float], end: tuple[float, float], height: float
-) -> tuple[Box, ...]:
+) -> tuple[Hull, ...]:
     """Wall from `start` to `end` (x, y) [m], in panels that follow the ground."""
     dx, dy = end[0] - start[0], end[1] - start[1]
     n_panels = max(1, math.ceil(math.hypot(dx, dy) / WALL_PANEL))

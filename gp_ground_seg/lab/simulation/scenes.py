@@ -1,7 +1,5 @@
 """Named scenes, each built from a seed around a drive along x from the origin."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence

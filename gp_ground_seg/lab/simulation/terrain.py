@@ -7,8 +7,6 @@ K s^2 / 2, and the root of that parabola is the largest step that is sure not to
 Why no mesh library: heights and labels are to be exact.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from abc import ABC, abstractmethod

@@ -1,37 +1,17 @@
 """Vehicles with bonnets, windscreens and wheels; persons and cyclists."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.lab.simulation import objects
-from gp_ground_seg.lab.simulation.objects import Interval, Kind, Solid
+from gp_ground_seg.lab.simulation.objects import Kind, Solid
 from gp_ground_seg.lab.simulation.terrain import Terrain
 
 Corners = tuple[tuple[float, float], ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Hull(Solid):
-    """Convex solid between planes: all p with ``normal . (p - (x, y, 0)) <= limit``."""
-
-    normals: FloatArray  # (K, 3), outward
-    limits: FloatArray  # (K,) [m]
-
-    def _outline(self, offset: FloatArray, rate: FloatArray) -> list[Interval]:
-        outward = self.normals @ rate.T
-        outward[np.abs(outward) < objects.SMALLEST_RATE] = objects.SMALLEST_RATE
-        at = (self.limits[:, None] - self.normals @ offset.T) / outward
-        leaves = outward > 0.0
-        enter, leave = np.where(leaves, -np.inf, at), np.where(leaves, at, np.inf)
-        return [(enter.max(axis=0), leave.min(axis=0))]
 
 
 class Model(NamedTuple):
@@ -116,7 +96,7 @@ def _extruded(
     corners: Sequence[tuple[float, float]],
     width: float,
     aside: float,
-) -> Hull:
+) -> objects.Hull:
     """Solid of a side view and a width, its middle `aside` [m] to the left of that of `pose`."""
     x, y, yaw = pose
     ground = float(terrain.height(x, y))
@@ -132,7 +112,7 @@ def _extruded(
     radius = math.hypot(float(np.abs(u).max()), 0.5 * width + abs(aside))
     rise = radius * math.hypot(slope_x, slope_y)
     bottom, top = ground + float(z.min()) - rise, ground + float(z.max()) + rise
-    return Hull(Kind.BOX, x, y, bottom, top, radius, np.array(normals), np.array(limits))
+    return objects.Hull(Kind.BOX, x, y, bottom, top, radius, np.array(normals), np.array(limits))
 
 
 def person(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
