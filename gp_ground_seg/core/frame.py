@@ -220,7 +220,8 @@ class Frame(NamedTuple):
     candidates: Candidates
     lines: Lines
     pseudo: PseudoInputs
-    # (C,) slope with which the ground goes on behind a candidate; -inf where it does not
+    # (C,) slope with which the ground goes on behind a candidate; -inf where it does not; NaN at
+    # the end of its segment
     onward: FloatArray
     in_face: BoolArray  # (C,) whether the tile of a candidate has a vertical face
     knots: FloatArray  # (K,) ranges where the surface is wanted [m], read-only

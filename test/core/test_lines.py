@@ -118,15 +118,15 @@ AHEAD = {
 }
 
 
-@pytest.mark.parametrize('name', AHEAD)
-def test_the_ground_carries_on_to_a_slope_and_not_to_a_step(backend, name):
-    ahead, is_followed = AHEAD[name]
+@pytest.mark.parametrize(('ahead', 'is_followed'), AHEAD.values(), ids=AHEAD)
+def test_the_ground_carries_on_to_a_slope_and_not_to_a_step(backend, ahead, is_followed):
     candidates = candidates_of(5.0 + 4.0 * np.arange(7), np.append(np.zeros(3), ahead))
     _, lines, _, onward, _ = backend.extract_lines(candidates, NO_FACES, Config())
     assert list(lines.start) == [0, 3, 7]
-    follows = is_walkable(ahead[0], 4.0, 0.2) and carries_on(ahead[0], 4.0, onward[3])
+    follows = is_walkable(ahead[0], 4.0, 0.2) and carries_on(ahead[0], 4.0, onward[3], np.nan)
     assert follows == is_followed
-    assert onward[5] == onward[6] == -np.inf  # too few behind
+    assert np.isnan(onward[5:]).all() == is_walkable(ahead[3] - ahead[2], 4.0, 0.2)
+    assert carries_on(0.4, 4.0, onward[6], 0.1) > carries_on(0.4, 4.0, onward[6], 0.05)
 
 
 def test_a_candidate_far_below_changes_no_line_of_other_segments(backend):

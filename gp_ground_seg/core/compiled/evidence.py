@@ -10,30 +10,26 @@ from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame
 from gp_ground_seg.core.gp import evidence
 from gp_ground_seg.core.gp.evidence import (
     CLEARLY,
-    ODDS,
     Evidence,
     combined_surface,
     is_on_object,
-    odds_of,
     shown_by,
 )
 from gp_ground_seg.core.gp.kernels import prior_variance
 from gp_ground_seg.core.gp.model import SegmentSurfaces
 from gp_ground_seg.core.jit import compiled_form, jit
-from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
+from gp_ground_seg.core.parameters.config import ObservationConfig
 
 
 @compiled_form(evidence.find_seeds)
-def find_seeds(
-    frame: Frame, theta: FloatArray, growth: GrowthConfig, slope_std: float, seed: BoolArray
-) -> float:
+def find_seeds(frame: Frame, theta: FloatArray, slope_std: float, seed: BoolArray) -> None:
     """Do what the twin does."""
-    candidates, knots, max_slope = frame.candidates, frame.knots, CLEARLY * slope_std
-    n_segments, n_bins = len(candidates.offsets) - 1, 0
+    candidates, knots, sigma_n = frame.candidates, frame.knots, math.exp(theta[1])
+    n_segments, n_bins, max_slope = len(candidates.offsets) - 1, 0, CLEARLY * slope_std
     for c in range(len(seed)):
         n_bins = max(n_bins, candidates.bin[c] + 1) if seed[c] else n_bins
     if n_bins == 0:
-        return ODDS
+        return
     table = np.full((n_segments, n_bins), np.inf)
     for m in range(n_segments):
         for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
@@ -51,18 +47,12 @@ def find_seeds(
             for j in range(np.uintp(n_bins)):
                 table[to, j] = min(table[to, j], table[by, j] + rise[j])
     _rise_along(table, n_bins, max_slope, knots)
-    n_standing = n_near = 0
-    sigma_n = math.exp(theta[1])
     for m in range(n_segments):
         for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
             if candidates.bin[i] < n_bins:
-                z = candidates.z[i] - frame.prior_mean
-                stands = is_on_object(z, table[m, candidates.bin[i]], sigma_n)
-                seed[i] &= not stands
-                n_standing += stands and not frame.in_face[i]
-                n_near += not frame.in_face[i]
-    odds: float = odds_of(n_standing, n_near)
-    return odds
+                seed[i] &= not is_on_object(
+                    candidates.z[i] - frame.prior_mean, table[m, candidates.bin[i]], sigma_n
+                )
 
 
 @jit()

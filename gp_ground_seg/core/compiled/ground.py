@@ -23,6 +23,7 @@ from gp_ground_seg.core.gp.ground import (
     fits,
     noise_among,
     noise_in_doubt,
+    slope_before,
     variances_of,
 )
 from gp_ground_seg.core.gp.kernels import (
@@ -266,7 +267,7 @@ def _find_joining(
     columns: _Columns,
 ) -> int:
     """Set the new ones to those from `done` on that now join; return their number."""
-    r, z, n_new, last = frame.candidates.r, columns.z, 0, done - 1
+    r, z, lines, n_new, last = frame.candidates.r, columns.z, frame.lines, 0, done - 1
     for i in range(done, len(inlier)):
         c = first + i
         if inlier[i]:
@@ -276,18 +277,22 @@ def _find_joining(
         if not has_inliers and columns.neighbour_precision[i] == 0.0:
             continue
         height, variance = _predict(i, columns)
-        joins = fits(z[i], height, variance, noise, growth)
-        if joins and odds > 0.0:
-            columns.noise[i] = noise_in_doubt(
-                z[i], height, variance, columns.noise[i], frame.in_face[c], odds
-            )
-        if not joins and last >= 0:
+        joins, goes_on = fits(z[i], height, variance, noise, growth), False
+        if last >= 0:
             rise, distance = z[i] - z[last], r[c] - r[first + last]
             walkable = is_walkable(rise, distance, growth.max_slope)
             if walkable and not frame.in_face[c] and not columns.above[i]:
-                joins = carries_on(rise, distance, frame.onward[c])
-            else:
+                line = lines.line[first + last]
+                extent = r[first + last] - r[lines.start[line]]
+                before = slope_before(lines.slope[line], extent, growth)
+                goes_on = carries_on(rise, distance, frame.onward[c], before)
+            elif not joins:
                 last = -1  # it stands on the ground, which does not go on behind it
+        if joins and odds > 0.0 and not goes_on:
+            columns.noise[i] = noise_in_doubt(
+                z[i], height, variance, columns.noise[i], frame.in_face[c], odds
+            )
+        joins |= goes_on
         if joins:
             columns.new[n_new] = i
             n_new += 1

@@ -17,7 +17,7 @@ from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, Values
 from gp_ground_seg.core.gp.kernels import prior_variance
 from gp_ground_seg.core.gp.model import SegmentSurfaces
 from gp_ground_seg.core.jit import choose, shared
-from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
+from gp_ground_seg.core.parameters.config import ObservationConfig
 
 STEP = 4
 """One of how many segments shows its ground to those beside it: neighbours see much the same."""
@@ -29,7 +29,7 @@ LEAST_STD = 1e-3
 LEAST_PRECISION = 1e-3
 """Precision below which a surface shows nothing [1/m^2]: rounding is left of the prior."""
 ODDS = 0.25
-"""Lower bound of the odds that a candidate is an obstacle."""
+"""Odds that a candidate is an obstacle."""
 
 
 class Evidence(NamedTuple):
@@ -114,33 +114,15 @@ def is_on_object(z: Values, highest: Values, sigma_n: Values) -> Values:
     return z > highest + sigma_n
 
 
-@shared
-def odds_of(n_standing: Values, n_candidates: Values) -> Values:
-    """Obstacles for each ground among the candidates of a frame.
-
-    `n_standing` of `n_candidates` near the sensor stand on something. Others may, so the odds are
-    at least `ODDS`. They are those of one obstacle and ``1 / ODDS`` of ground more, so that few
-    candidates change them little.
-    """
-    seen = (n_standing + 1.0) / (n_candidates - n_standing + 1.0 / ODDS)
-    return np.maximum(seen, ODDS)
-
-
-def find_seeds(
-    frame: Frame, theta: FloatArray, growth: GrowthConfig, slope_std: float, seed: BoolArray
-) -> float:
-    """Remove candidates that stand on others from `seed` (C,); return the odds of `odds_of`.
+def find_seeds(frame: Frame, theta: FloatArray, slope_std: float, seed: BoolArray) -> None:
+    """Remove candidates that stand on others from `seed` (C,).
 
     Seeds are low and near (``growth.seed_height_tolerance``, ``growth.seed_range``). What stands
-    higher over one of these than noise and prior slope explain stands on something. Candidates
-    as near as the farthest of them and not in vertical faces count for the odds.
+    higher over one of these than noise and prior slope explain stands on something.
     """
     z = frame.candidates.z - frame.prior_mean
     highest = highest_ground(frame, z, seed, CLEARLY * slope_std)
-    stands = is_on_object(z, highest, np.exp(theta[1]))
-    counts = np.isfinite(highest) & ~frame.in_face
-    seed &= ~stands
-    return float(odds_of(np.count_nonzero(stands & counts), np.count_nonzero(counts)))
+    seed &= ~is_on_object(z, highest, np.exp(theta[1]))
 
 
 def highest_ground(frame: Frame, z: FloatArray, seed: BoolArray, max_slope: float) -> FloatArray:

@@ -103,14 +103,12 @@ def fit_surfaces(
     """
     knots, mean, std = frame.knots, found.mean, found.std
     u, knot_u = found.log_length_scale, found.knot_log_length_scale
-    observation, growth, odds = model.observation, model.growth, ODDS
+    observation, odds = model.observation, ODDS if model.by_roughness else 0.0
     if model.is_latent:
         latent_log_length_scales(frame, given, 1, u, knot_u)
-    if model.uses_neighbours:
-        odds = find_seeds(frame, given, growth, observation.slope_std, found.seed)
-    odds = odds if model.by_roughness else 0.0
     from_neighbours = Evidence(np.empty((0, 0)), np.empty((0, 0)))
     if model.uses_neighbours:
+        find_seeds(frame, given, observation.slope_std, found.seed)
         grow_inliers(frame, given, model, odds, from_neighbours, STEP, found)
         regress(frame, given, observation, STEP, found)
         from_neighbours = evidence_of_neighbours(mean, std, knots, given, observation)
@@ -127,7 +125,7 @@ def fit_surfaces(
 OBSTACLE_DEPTH = 1.0
 """Height over which the lowest returns of obstacles are spread [m]."""
 ODDS_IN_FACE = 4.0
-"""Lower bound of the odds that a candidate in a vertical face is an obstacle."""
+"""Odds that a candidate in a vertical face is an obstacle."""
 MOST_DOUBT = 30.0
 """Logarithm of odds that are as good as infinite."""
 ROUNDING, ROUNDING_SINGLE = 1e-12, 1e-6
@@ -220,13 +218,12 @@ def noise_in_doubt(
 
     As for the labels, ground and obstacle are compared: the heights of the one are distributed by
     the prediction, those of the other evenly over `OBSTACLE_DEPTH`; `odds` are the obstacles for
-    each ground in the frame. With this noise the variance
-    of the prediction shrinks by the probability of ground times what certain ground would take
-    from it: a candidate in doubt shows little (probabilistic data association). Obstacles stand
-    above the ground, so there is no doubt below.
+    each ground. With this noise the variance of the prediction shrinks by the probability of
+    ground times what certain ground would take from it: a candidate in doubt shows little
+    (probabilistic data association). Obstacles stand above the ground, so there is no doubt below.
     """
     residual, spread = z - height, variance + noise
-    odds = choose(in_face, np.maximum(odds, ODDS_IN_FACE), odds)
+    odds = choose(in_face, ODDS_IN_FACE, odds)
     density = np.sqrt(2.0 * np.pi * spread) / OBSTACLE_DEPTH
     doubt = odds * density * np.exp(np.minimum(0.5 * residual * residual / spread, MOST_DOUBT))
     return noise + choose(residual > 0.0, doubt * spread, 0.0)
@@ -249,15 +246,18 @@ def grow_inliers(
     before (see `carries_on`). This repeats until none joins (GP-INSAC of Chen et al. 2014; the
     paper's outlier rejection).
 
-    `from_neighbours` is the evidence of the segments beside each. Unless `odds`, of `odds_of`, are
-    0, a candidate among others, or that joins in doubt, shows less: see `noise_among` and
-    `noise_in_doubt`.
+    `from_neighbours` is the evidence of the segments beside each. Unless `odds` are 0, a candidate
+    among others, or that joins in doubt, shows less: see `noise_among` and `noise_in_doubt`. Where
+    the ground carries on to it there is no doubt.
     """
     candidates, z = frame.candidates, frame.candidates.z - frame.prior_mean
     sill, gate_noise = variances_of(frame, theta, model.observation, ROUNDING_SINGLE)
     found.alike[:] = _count_near(candidates, np.exp(theta[3]) if odds > 0.0 else 0.0)
     noise, beside = noise_among(found.alike, gate_noise), at_candidates(from_neighbours, frame)
     above = contradicts(*beside, z, gate_noise)
+    lines = frame.lines
+    extent = candidates.r - candidates.r[lines.start[lines.line]]
+    slope = slope_before(lines.slope[lines.line], extent, model.growth)
     found.inlier[:], found.doubt[:] = False, 0.0
     for segments in batches(np.arange(0, candidates.n_segments, step), candidates.offsets):
         layout = Padded.of(segments, candidates.offsets)
@@ -273,6 +273,7 @@ def grow_inliers(
             mask,
             (found.seed & ~above)[place] & mask,
             layout.take(frame.onward, -np.inf),
+            slope[place],
             frame.in_face[place],
             above[place],
             Evidence(layout.take(beside.height), layout.take(beside.precision)),
@@ -296,6 +297,7 @@ class _Batch(NamedTuple):
     mask: BoolArray  # (S, n)
     seed: BoolArray  # (S, n)
     onward: FloatArray  # (S, n)
+    slope_before: FloatArray  # (S, n)
     in_face: BoolArray  # (S, n)
     above: BoolArray  # (S, n) the evidence contradicts it
     from_neighbours: Evidence  # (S, n)
@@ -328,10 +330,11 @@ def _grow(batch: _Batch, growth: GrowthConfig, odds: float) -> BoolArray:
         # Before anything has joined, only the evidence of neighbours decides.
         may_join = ~chosen & batch.mask
         may_join &= chosen.any(axis=1, keepdims=True) | (batch.from_neighbours.precision > 0.0)
+        on_slope = _on_slope(batch, chosen, fitting, growth)
         if odds > 0.0:
             doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, batch.in_face, odds)
-            batch.noise[:] = np.where(may_join & fitting, doubtful, batch.noise)
-        joining = may_join & (fitting | _on_slope(batch, chosen, fitting, growth))
+            batch.noise[:] = np.where(may_join & fitting & ~on_slope, doubtful, batch.noise)
+        joining = may_join & (fitting | on_slope)
         grows = joining[active].any(axis=1)
         active, whitened = active[grows], whitened[grows]
     return chosen
@@ -356,18 +359,27 @@ def _on_slope(
     distance = batch.r - batch.r[own, before]
     walkable = is_walkable(rise, distance, growth.max_slope) & ~batch.in_face & ~batch.above
     is_open = (before >= 0) & (last(~chosen & ~fitting & ~walkable) < before)
-    result: BoolArray = is_open & walkable & carries_on(rise, distance, batch.onward)
+    goes_on = carries_on(rise, distance, batch.onward, batch.slope_before[own, before])
+    result: BoolArray = is_open & walkable & goes_on
     return result
 
 
 @shared
-def carries_on(rise: Values, distance: Values, onward: Values) -> Values:
+def carries_on(rise: Values, distance: Values, onward: Values, before: Values) -> Values:
     """Whether ground that rises so much [m] over a distance [m] goes on so.
 
-    `onward` is the slope behind: where it is less, the ground has come to an object. Ground that
-    falls needs no more evidence, as obstacles lie only above it.
+    `onward` is the slope behind: where it is less, the ground has come to an object. At the end of
+    a segment (NaN) it is `before`, see `slope_before`. Ground that falls needs no more evidence,
+    as obstacles lie only above it.
     """
-    return (rise <= 0.0) | (RISES_ON * rise <= onward * distance)
+    slope = choose(np.isnan(onward), before, onward)
+    return (rise <= 0.0) | (RISES_ON * rise <= slope * distance)
+
+
+@shared
+def slope_before(slope: Values, extent: Values, growth: GrowthConfig) -> Values:
+    """Slope of a line up to one of its candidates, after an extent [m]; NaN if that is short."""
+    return choose(extent >= growth.min_rise_extent, slope, np.nan)
 
 
 def _rows(batch: _Batch, segment: IntArray, place: IntArray) -> FloatArray:

@@ -280,22 +280,24 @@ def find_onward(candidates: Candidates, growth: GrowthConfig, onward: FloatArray
     """Slope with which the ground goes on behind each candidate, into `onward` (C,).
 
     Over at least two more candidates and ``growth.min_rise_extent``, with no step between two;
-    -inf where it does not.
+    -inf where it does not, NaN where the segment ends before that shows.
     """
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     for m in range(len(offsets) - 1):
         # The first that is far enough from c; the first that no walkable steps from c lead to.
-        far = step = offsets[m]
-        for c in range(offsets[m], offsets[m + 1]):
+        far, step, stop = offsets[m], offsets[m], offsets[m + 1]
+        for c in range(offsets[m], stop):
             onward[c] = -math.inf
             far, step = max(far, c + 2), max(step, c + 1)
-            while far < offsets[m + 1] and r[far] - r[c] < growth.min_rise_extent:
+            while far < stop and r[far] - r[c] < growth.min_rise_extent:
                 far += 1
-            while step <= far < offsets[m + 1] and is_walkable(
+            while step < min(far + 1, stop) and is_walkable(
                 z[step] - z[step - 1], r[step] - r[step - 1], growth.max_slope
             ):
                 step += 1
-            if far < step:
+            if step == stop <= far:
+                onward[c] = math.nan
+            elif far < step:
                 onward[c] = (z[far] - z[c] + growth.max_slope * UNEVEN) / (r[far] - r[c])
 
 
