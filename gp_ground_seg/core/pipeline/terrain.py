@@ -275,11 +275,11 @@ def least_width(over_steep: Values) -> Values:
 
 
 def with_standing(faces: Faces, tile: CellArray, stands: BoolArray) -> Faces:
-    """Faces, and tiles of which all candidates stand on the ground.
+    """Faces, and tiles of which all candidates stand on the ground: they show none.
 
     `tile` and `stands` (C,) are of the candidates.
     """
-    is_face = np.zeros_like(faces.is_face)
-    is_face[tile[stands]] = True
-    is_face[tile[~stands]] = False
-    return faces._replace(is_face=faces.is_face | is_face)
+    shows_none = np.zeros_like(faces.is_face)
+    shows_none[tile[stands]] = True
+    shows_none[tile[~stands]] = False
+    return Faces(faces.is_face | shows_none, faces.has_occluded_base | shows_none, faces.is_steep)
