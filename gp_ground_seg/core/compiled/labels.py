@@ -38,6 +38,7 @@ from gp_ground_seg.core.pipeline.labels import (
     whole_units,
 )
 from gp_ground_seg.core.pipeline.relief import height_in
+from gp_ground_seg.core.pipeline.vertical_faces import is_flat
 
 # Plain integers, as compiled code has no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
@@ -76,13 +77,14 @@ def label_points(
     near_tile, sums = _survey(scan, *tables, highest, units, shift, result.height)
     if by_roughness:
         set_roughness(scan.tiles, sums, faces.is_face, units, shift, roughness)
-    bands, tops = np.empty((2, n_tiles + 1), result.height.dtype)
+    bands, tops, tops_if_flat = limits = np.full((3, n_tiles + 1), math.inf, result.height.dtype)
     for t in range(n_tiles + 1):
-        bands[t], tops[t] = ground_band(roughness[t], highest, config), math.inf
+        bands[t] = ground_band(roughness[t], highest, config)
         if faces.is_face[t]:
             low, is_occluded = np.float64(scan.tiles.extremes[t, 0]), faces.has_occluded_base[t]
             tops[t] = top_of_face(roughness[t], low, is_occluded, config)
-    _label_by_bands(scan, bands, tops, number(depth), result)
+            tops_if_flat[t] = tops[t] if is_occluded else math.inf
+    _label_by_bands(scan, limits, number(depth), config, result)
     if by_roughness:
         _vote(scan, near_tile, lowest, config, result)
 
@@ -170,15 +172,19 @@ def _add_squares(
 
 @jit()
 def _label_by_bands(
-    scan: Scan, bands: PointArray, tops: PointArray, depth: float, result: Labelled
+    scan: Scan, limits: PointArray, depth: float, config: LabelConfig, result: Labelled
 ) -> None:
-    """Label the points from their heights in `result`; `bands` and `tops` are those of tiles."""
+    """Label the points from their heights in `result`.
+
+    `limits` (3, T + 1) are bands and tops of tiles, and tops where a cell is flat.
+    """
     z, tile, cell = scan.xyz[2], scan.tiles.tile, scan.grid.cell
     height, label, margins = result.height, result.label, result.margin
-    last, zero = np.int32(len(bands) - 1), z.dtype.type(0.0)
+    last, zero = np.int32(limits.shape[1] - 1), z.dtype.type(0.0)
     for i in range(len(tile)):
-        t = np.uintp(tile[i] if tile[i] >= 0 else last)
-        margins[i] = margin_of(height[i], z[i], bands[t], tops[t], depth)
+        t, c = np.uintp(tile[i] if tile[i] >= 0 else last), np.uintp(max(cell[i], np.int32(0)))
+        top = limits[np.uintp(1 + is_flat(scan.extent[c], config)), t]
+        margins[i] = margin_of(height[i], z[i], limits[0, t], top, depth)
     # A loop of its own has vector instructions.
     for i in range(len(cell)):
         otherwise = np.uint8(_UNKNOWN) if cell[i] == NOT_FINITE else np.uint8(_OBSTACLE)

@@ -36,6 +36,7 @@ def build_grid(
     grid: PolarGrid,
     tiles: Tiles,
     candidates: Candidates,
+    extent: FloatArray,
 ) -> tuple[int, int]:
     """Sort points, (3, N), into cells and tiles, with the extremes of each.
 
@@ -65,6 +66,8 @@ def build_grid(
         block = slice(first, min(first + BLOCK, len(r)))
         own = columns[:, block], r[block], cell[block], tile[block]
         _resolve_lowest(*own, tiles.place, extremes, numbers)
+    for k in range(n_cells):
+        extent[k] = np.float64(extremes[k, 2]) - np.float64(extremes[k, 0])
     return n_tiles, _take_candidates(extremes, numbers, geometry.edges, min_extent, candidates)
 
 

@@ -11,7 +11,16 @@ import math
 import numpy as np
 
 from gp_ground_seg.core.compiled.roughness import level_at, levels_about, levels_of
-from gp_ground_seg.core.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Scan, Tiles
+from gp_ground_seg.core.frame import (
+    OUTSIDE,
+    BoolArray,
+    CellArray,
+    Faces,
+    FloatArray,
+    PointArray,
+    Scan,
+    Tiles,
+)
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import FacesConfig, LabelConfig
 from gp_ground_seg.core.pipeline.roughness import N_LEVELS, UNKNOWN, UNKNOWN_LEVEL
@@ -26,6 +35,7 @@ from gp_ground_seg.core.pipeline.vertical_faces import (
     is_base_occluded,
     is_beyond_edge,
     is_examined,
+    is_flat,
     is_steep,
     is_vertical,
     scatter_square,
@@ -47,6 +57,7 @@ def find_faces(
     Points are (3, N).
     """
     tiles, candidates = scan.tiles, scan.candidates
+    shows_ground = _with_flat_foot(scan, label)
     tall, tile_to_row = _select_tall(tiles, height, label)
     sums = _sum_returns(scan.xyz, tiles, tall, config.cell_size, label, tile_to_row)
     square = np.empty(len(tall))
@@ -56,7 +67,8 @@ def find_faces(
         is_face = reaches and is_vertical(low, high, config)
         faces.is_face[t] = is_face
         faces.is_steep[t] = reaches and is_steep(high)
-        faces.has_occluded_base[t] = is_face and is_base_occluded(low, high, config)
+        is_occluded = is_face and not shows_ground[t] and is_base_occluded(low, high, config)
+        faces.has_occluded_base[t] = is_occluded
         square[k] = UNKNOWN if is_face else scatter_square(low, high)
     _mark_scattered(tiles, tall, square, height, label, faces)
     for m in range(len(candidates.offsets) - 1):
@@ -66,6 +78,19 @@ def find_faces(
             if is_beyond_edge(r - before, r, candidates.z[c] + height, label):
                 faces.has_occluded_base[tile] = faces.is_face[tile]
             before = r
+
+
+@jit()
+def _with_flat_foot(scan: Scan, label: LabelConfig) -> BoolArray:
+    """Whether some of the lowest returns of each tile are in a flat cell, (T,)."""
+    candidates, lowest = scan.candidates, scan.tiles.extremes[:, 0]
+    result, n_bins = np.zeros(len(lowest), np.bool_), len(scan.grid.edges) - 1
+    for m in range(len(candidates.offsets) - 1):
+        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            extent, tile = scan.extent[m * n_bins + candidates.bin[c]], candidates.tile[c]
+            is_foot = candidates.z[c] - np.float64(lowest[tile]) <= label.ground_tolerance
+            result[tile] |= is_foot and is_flat(extent, label)
+    return result
 
 
 @jit()

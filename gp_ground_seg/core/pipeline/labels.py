@@ -26,6 +26,7 @@ from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, LabelConfig
 from gp_ground_seg.core.pipeline.relief import Relief
 from gp_ground_seg.core.pipeline.roughness import ground_roughness
+from gp_ground_seg.core.pipeline.vertical_faces import is_flat
 
 HIGHEST_GROUND = 0.5
 """Height over the surface from which no return is ground, however rough the ground is [m]; returns
@@ -77,12 +78,16 @@ def label_points(
         sums = near_sums(over[near], tile[near], faces.is_face, units)
         roughness = ground_roughness(tiles, sums, units)
     band = ground_band(roughness, highest, label).astype(dtype)
-    top = np.full(len(roughness), np.inf, dtype)
-    at, occluded = np.flatnonzero(faces.is_face), faces.has_occluded_base[faces.is_face]
-    top[at] = top_of_face(roughness[at], tiles.lowest_z[at].astype(np.float64), occluded, label)
+    top, top_if_flat = np.full((2, len(roughness)), np.inf, dtype)
+    at, occluded = np.flatnonzero(faces.is_face), faces.has_occluded_base
+    lowest = tiles.lowest_z[at].astype(np.float64)
+    top[at] = top_of_face(roughness[at], lowest, occluded[at], label)
+    top_if_flat[occluded] = top[occluded]
+    is_in_flat = is_flat(scan.extent[grid.cell], label)
     depth = depth_of_ground(height, label)
+    top = np.where(is_in_flat, top_if_flat[tile], top[tile])
     with np.errstate(invalid='ignore'):  # points outside may be infinitely high
-        margin: PointArray = margin_of(over, z, band[tile], top[tile], depth)
+        margin: PointArray = margin_of(over, z, band[tile], top, depth)
     if by_roughness:
         heights = z[near].astype(np.float64) - lowest_of(surface)
         voters, means = mean_votes(near, heights, margin, tiles, label.ground_tolerance)

@@ -43,7 +43,8 @@ def build_scan(xyz: PointArray, config: Config) -> Scan:
     tiles = build_tiles(xyz, grid, geometry)
     extremes, numbers = reduce_cells(grid, xyz, tiles.tile)
     candidates = ground_candidates(extremes, numbers, grid.edges, config.lines.min_density_extent)
-    return Scan(xyz, grid, tiles, candidates)
+    extent = extremes[:, 2].astype(np.float64) - extremes[:, 0]
+    return Scan(xyz, grid, tiles, candidates, extent)
 
 
 def bin_edges(grid: GridConfig) -> FloatArray:

@@ -103,6 +103,7 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     result.is_face[tall] = reaches & is_vertical(foot, rest, faces)
     result.is_steep[tall] = reaches & is_steep(rest)
     result.has_occluded_base[tall] = result.is_face[tall] & is_base_occluded(foot, rest, faces)
+    result.has_occluded_base[_with_flat_foot(scan, label)] = False
     square = np.where(result.is_face[tall], UNKNOWN, scatter_square(foot, rest))
     rough = tall[_scattered(tiles.place[tall], n_sides, square, extent, over, label)]
     result.is_face[rough] = result.has_occluded_base[rough] = True
@@ -113,6 +114,14 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     beyond = candidates.tile[is_beyond]
     result.has_occluded_base[beyond] = result.is_face[beyond]
     return result
+
+
+def _with_flat_foot(scan: Scan, label: LabelConfig) -> CellArray:
+    """Tiles of whose lowest returns some are in a flat cell, with repetitions."""
+    candidates = scan.candidates
+    cell = candidates.segment * scan.grid.n_bins + candidates.bin
+    is_foot = candidates.z - scan.tiles.lowest_z[candidates.tile] <= label.ground_tolerance
+    return candidates.tile[is_foot & is_flat(scan.extent[cell], label)]
 
 
 def _scattered(
@@ -136,6 +145,12 @@ def _scattered(
     about = SCATTER[levels_about(place, level, n_sides, SCATTERED, 0)]
     result: BoolArray = (level != UNKNOWN_LEVEL) & (over > face) & (about > smooth_up_to(own))
     return result
+
+
+@shared
+def is_flat(extent: Values, label: LabelConfig) -> Values:
+    """Whether a cell is of no vertical face: of several points, none much higher than others."""
+    return (extent > 0.0) & (extent <= label.ground_tolerance)
 
 
 @shared
