@@ -11,16 +11,7 @@ import math
 import numpy as np
 
 from gp_ground_seg.core.compiled.roughness import level_at, levels_about, levels_of
-from gp_ground_seg.core.frame import (
-    OUTSIDE,
-    BoolArray,
-    CellArray,
-    Faces,
-    FloatArray,
-    PointArray,
-    Scan,
-    Tiles,
-)
+from gp_ground_seg.core.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Scan, Tiles
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import FacesConfig, LabelConfig
 from gp_ground_seg.core.pipeline.roughness import N_LEVELS, UNKNOWN, UNKNOWN_LEVEL
@@ -42,10 +33,9 @@ from gp_ground_seg.core.pipeline.vertical_faces import (
     smooth_up_to,
 )
 
-# Each tall tile has two rows, for the lowest returns and for those above: their sums and the
-# greatest height. The first row also holds the origin of the tile.
-_TOP, _X, _Y, _BASE = SUMS, SUMS + 1, SUMS + 2, SUMS + 3
-N_COLUMNS = SUMS + 4
+# Each tall tile has two rows, for the lowest returns and for those above: their sums. The first
+# row also holds the origin of the tile.
+_X, _Y, _BASE, N_COLUMNS = SUMS, SUMS + 1, SUMS + 2, SUMS + 3
 
 
 @jit(entry=True)
@@ -56,14 +46,20 @@ def find_faces(
 
     Points are (3, N).
     """
-    tiles, candidates = scan.tiles, scan.candidates
-    shows_ground = _with_flat_foot(scan, label)
+    tiles, candidates, n_bins = scan.tiles, scan.candidates, len(scan.grid.edges) - 1
+    shows_ground, tolerance = np.zeros(len(tiles.place), np.bool_), label.ground_tolerance
+    for m in range(len(candidates.offsets) - 1):
+        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            cell, t = m * n_bins + candidates.bin[c], candidates.tile[c]
+            is_foot = candidates.z[c] - np.float64(tiles.extremes[t, 0]) <= tolerance
+            shows_ground[t] |= is_foot and is_flat(scan.extent[cell], tolerance)
     tall, tile_to_row = _select_tall(tiles, height, label)
     sums = _sum_returns(scan.xyz, tiles, tall, config.cell_size, label, tile_to_row)
     square = np.empty(len(tall))
     for k in range(len(tall)):
         t, low, high = np.uintp(tall[k]), sums[2 * k], sums[2 * k + 1]
-        reaches = max(low[_TOP], high[_TOP]) > face_height(label)
+        extent = np.float64(tiles.extremes[t, 1]) - np.float64(tiles.extremes[t, 0])
+        reaches = extent > face_height(label)
         is_face = reaches and is_vertical(low, high, config)
         faces.is_face[t] = is_face
         faces.is_steep[t] = reaches and is_steep(high)
@@ -78,19 +74,6 @@ def find_faces(
             if is_beyond_edge(r - before, r, candidates.z[c] + height, label):
                 faces.has_occluded_base[tile] = faces.is_face[tile]
             before = r
-
-
-@jit()
-def _with_flat_foot(scan: Scan, label: LabelConfig) -> BoolArray:
-    """Whether some of the lowest returns of each tile are in a flat cell, (T,)."""
-    candidates, lowest = scan.candidates, scan.tiles.extremes[:, 0]
-    result, n_bins = np.zeros(len(lowest), np.bool_), len(scan.grid.edges) - 1
-    for m in range(len(candidates.offsets) - 1):
-        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
-            extent, tile = scan.extent[m * n_bins + candidates.bin[c]], candidates.tile[c]
-            is_foot = candidates.z[c] - np.float64(lowest[tile]) <= label.ground_tolerance
-            result[tile] |= is_foot and is_flat(extent, label)
-    return result
 
 
 @jit()
@@ -178,5 +161,4 @@ def _sum_returns(
         s[7] += dx * dy
         s[8] += dx * dz
         s[9] += dy * dz
-        s[_TOP] = max(s[_TOP], above)
     return sums
