@@ -61,12 +61,10 @@ class NumbaBackend:
         at = np.full(n_places, OUTSIDE, np.int32)
         tiles = Tiles(tile, np.empty((n, 2), dtype), np.empty(n, np.int32), at)
         candidates = Candidates.buffers(n_segments * n_bins, n_segments)
-        min_extent = config.lines.min_density_extent
-        n, n_candidates = polar_grid.build_grid(
-            xyz.T, geometry, min_extent, grid, tiles, candidates
-        )
+        extent, least = np.empty(n_segments * n_bins), config.lines.min_density_extent
+        n, count = polar_grid.build_grid(xyz.T, geometry, least, grid, tiles, candidates, extent)
         tiles = tiles._replace(extremes=tiles.extremes[:n], place=tiles.place[:n])
-        return Scan(xyz, grid, tiles, candidates.first(n_candidates))
+        return Scan(xyz, grid, tiles, candidates.first(count), extent)
 
     def find_faces(self, scan: Scan, height: float, config: Config) -> Faces:
         """Tiles that show no ground."""
