@@ -9,7 +9,8 @@ import math
 import os
 import textwrap
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice, takewhile
 from numbers import Real
 from pathlib import Path
 from time import perf_counter
@@ -24,6 +25,7 @@ from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_
 from gp_ground_seg.core.gp.learning import Learned
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.parameters.schema import NO_BOX
+from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.ground_view import (
     LOWER_ENDS,
     MAX_TILT,
@@ -42,6 +44,7 @@ from gp_ground_seg.core.pipeline.mirror_images import (
     find_mirror_images,
     in_sight,
     mirror_share,
+    near_to,
 )
 from gp_ground_seg.core.pipeline.points import (
     ENOUGH_POINTS,
@@ -60,6 +63,10 @@ from gp_ground_seg.core.pipeline.sensor_pose import (
     with_fallback,
 )
 from gp_ground_seg.core.result import Segmentation
+
+
+N_SEEN = 4
+"""Planes of a wet scan that are asked whether they are the mirror."""
 
 
 class GroundSegmenter:
@@ -257,12 +264,12 @@ class GroundSegmenter:
         level, elsewhere = given.level(about), None
         scan = backend.build_grid(level, config)
         timer.mark('grid')
-        below, seen = self._past_images(scan, self._look(scan))
+        below = self._past_images(scan, self._look(scan))
         view = self._find_ground(level, below) if is_doubtful(below) else below
         if view is not None and not view.can_level:
             # The scan will not be levelled: the ground that matters is about level.
             elsewhere = view if view.tells_tilt else None
-            view = self._look(seen, max_tilt=CLEAR_TILT) or below
+            view = self._look(scan, max_tilt=CLEAR_TILT) or below
         objection = objection_to_ground(scan, view)
         pose = estimate_pose(sensor, None if objection else view, elsewhere, objection)
         if fallback is not None:
@@ -281,27 +288,31 @@ class GroundSegmenter:
         timer.mark('pose')
         return scan, pose, images, config
 
-    def _past_images(self, scan: Scan, below: View | None) -> tuple[View | None, Scan]:
-        """View of a mirror: by the candidates that are no images of it, if these show one.
-
-        Else `below`, and the scan as it is.
-        """
+    def _past_images(self, scan: Scan, below: View | None) -> View | None:
+        """View of a mirror, if candidates that are no images of it show one; else `below`."""
         if below is not None:
             below = below._replace(is_mirror=mirror_share(below.plane, scan) >= MIRRORED)
             if not (below.is_mirror or below.may_be_image):
-                return below, scan
+                return below
         left = scan._replace(candidates=in_sight(scan.candidates))
-        view = self._look(left)
-        if view is not None and view.is_whole and mirror_share(view.plane, scan) >= MIRRORED:
-            return view._replace(is_mirror=True), left
-        return below, scan
+        for plane in islice(self._planes(left), N_SEEN):
+            view = View(plane, UPRIGHT, is_mirror=True)
+            if view.is_whole and mirror_share(plane, scan) >= MIRRORED:
+                # Again, without the images that were lowest in their cells.
+                near = self._look(left._replace(candidates=near_to(plane, left.candidates)))
+                return (near or view)._replace(is_mirror=True)
+        return below
+
+    def _planes(self, scan: Scan, max_tilt: float = MAX_TILT) -> Iterator[GroundPlane]:
+        """Planes of a scan, the best first, up to one that is a ceiling."""
+        planes = self._backend.find_planes(scan.candidates, math.tan(max_tilt))
+        return takewhile(lambda plane: not is_ceiling(plane, scan), planes)
 
     def _look(
         self, scan: Scan, turn: FloatArray = UPRIGHT, max_tilt: float = MAX_TILT
     ) -> View | None:
-        """Plane of a scan that `turn` has rotated, unless it is a ceiling."""
-        plane = self._backend.fit_plane(scan.candidates, math.tan(max_tilt))
-        return None if plane is None or is_ceiling(plane, scan) else View(plane, turn)
+        """Best plane of a scan that `turn` has rotated."""
+        return next((View(plane, turn) for plane in self._planes(scan, max_tilt)), None)
 
     def _find_ground(self, xyz: PointArray, below: View | None) -> View | None:
         """Plane of the ground, about z or another axis; that `below` z is doubtful."""

@@ -10,7 +10,7 @@ from rooms import HALL
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.core.pipeline.ground_plane import fit_plane
+from gp_ground_seg.core.pipeline.ground_plane import find_planes
 from gp_ground_seg.core.pipeline.mirror_images import (
     DEEP,
     MIRRORED,
@@ -127,7 +127,7 @@ def test_a_polished_floor_is_a_mirror_and_tables_are_not():
     ):
         points = hall(height, steepest, **kind).points[:, :3]
         scan = NumpyBackend().build_grid(np.ascontiguousarray(points), Config())
-        plane = fit_plane(in_sight(scan.candidates), 1.0)
+        plane = next(find_planes(in_sight(scan.candidates), 1.0))
         share = mirror_share(plane, scan)
         assert -plane.height == pytest.approx(plane_z, abs=0.03)
         assert share > MIRRORED + 0.2 if 'share' in kind else share < MIRRORED - 0.1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray
@@ -11,7 +13,6 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     CLEARLY_OFF,
     LEAST_REACH,
     MAX_Z,
-    MIN_CELLS,
     N_CELLS,
     N_RINGS,
     N_SECTORS,
@@ -25,10 +26,9 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     best_of,
     cells_of,
     crossing_of,
-    described,
     distance,
     levelness,
-    own_level,
+    planes_of,
     refined,
     refutation_by,
     set_hypotheses,
@@ -38,18 +38,19 @@ from gp_ground_seg.core.pipeline.ground_plane import (
 )
 
 
-def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
-    """Do what `gp_ground_seg.core.pipeline.ground_plane.fit_plane` does, to rounding."""
+def find_planes(candidates: Candidates, max_slope: float) -> Iterator[GroundPlane]:
+    """Do what `gp_ground_seg.core.pipeline.ground_plane.find_planes` does, to rounding."""
     indices, is_alone = np.empty((3, N_CELLS), np.int64), np.empty(N_CELLS, np.bool_)
     n = _tabulate(candidates, indices, is_alone)
-    if n < MIN_CELLS:
-        return None
     cell, chosen, lowest = indices[:, :n]
-    cells = cells_of(candidates, cell, chosen, lowest, is_alone[:n])
-    return described(cells, *own_level(cells, max_slope, _LOOPS))
+    return planes_of(cells_of(candidates, cell, chosen, lowest, is_alone[:n]), max_slope, _LOOPS)
 
 
-_LOOPS = Loops(jit(entry=True)(set_hypotheses), jit(entry=True)(best_of), jit(entry=True)(refined))
+_LOOPS = Loops(
+    jit(entry=True)(set_hypotheses),
+    jit(entry=True)(best_of),
+    jit(entry=True)(refined),
+)
 
 
 @jit(entry=True)

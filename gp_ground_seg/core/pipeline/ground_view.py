@@ -104,12 +104,12 @@ class View(NamedTuple):
     @property
     def is_well_supported(self) -> bool:
         """Whether enough of the lowest points lie on it to level a scan by it."""
-        return self.plane.support >= MIN_SUPPORT or self.is_mirror
+        return self.plane.support >= MIN_SUPPORT or self.is_whole
 
     @property
     def may_be_image(self) -> bool:
         """Whether it may be a mirror image, as of the ceiling in a polished floor."""
-        return self.plane.overhung >= OVERHUNG or not self.is_well_supported
+        return self.plane.overhung >= OVERHUNG or self.plane.support < MIN_SUPPORT
 
     @property
     def is_surface(self) -> bool:
@@ -152,7 +152,7 @@ def is_ceiling(plane: GroundPlane, scan: Scan) -> bool:
 
 def is_doubtful(below: View | None) -> bool:
     """Whether the plane below z is so poor, or so far away, that z may not be up."""
-    if below is None or below.is_steep or not (below.is_well_supported or below.is_whole):
+    if below is None or below.is_steep or not below.is_well_supported:
         return True
     return below.plane.height > TALL and below.plane.support < GOOD_SUPPORT
 

@@ -147,6 +147,12 @@ def in_sight(candidates: Candidates) -> Candidates:
     return candidates.where((slope < 0.0) & (slope >= nearer))
 
 
+def near_to(plane: GroundPlane, candidates: Candidates) -> Candidates:
+    """Candidates within two tolerances of a plane."""
+    off = np.abs(plane.below(candidates.x, candidates.y, candidates.z))
+    return candidates.where(off < 2.0 * tolerance_at(candidates.r))
+
+
 def slope_of_sight(r: FloatArray, z: FloatArray) -> FloatArray:
     """Slope of the line of sight to returns at a range and a height [m]."""
     return np.asarray(z / np.maximum(r, NEAREST))
