@@ -33,7 +33,7 @@ def images_in(points, sensor):
     pose = GroundSegmenter(config).segment(points).pose
     about = moved(points[:, :3], pose.origin)
     scan = NumpyBackend().build_grid(pose.level(np.ascontiguousarray(about)), config)
-    found = find_mirror_images(scan, pose)
+    found = find_mirror_images(scan, pose, None)
     is_image = np.zeros(len(points), dtype=bool)
     is_image[found.points] = True
     return is_image, found
