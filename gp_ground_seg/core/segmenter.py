@@ -25,6 +25,7 @@ from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_
 from gp_ground_seg.core.gp.learning import Learned
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.parameters.schema import NO_BOX
+from gp_ground_seg.core.pipeline.ground_plane import tolerance_at
 from gp_ground_seg.core.pipeline.ground_view import (
     LOWER_ENDS,
     MAX_TILT,
@@ -42,7 +43,6 @@ from gp_ground_seg.core.pipeline.mirror_images import (
     find_mirror_images,
     in_sight,
     mirror_share,
-    near_to,
 )
 from gp_ground_seg.core.pipeline.points import (
     ENOUGH_POINTS,
@@ -62,10 +62,8 @@ from gp_ground_seg.core.pipeline.sensor_pose import (
 )
 from gp_ground_seg.core.result import Segmentation
 
-
 MOST_PLANES = 4
 """Planes of a scan that are looked at for one that may be the ground, or a mirror."""
-
 
 
 class GroundSegmenter:
@@ -300,7 +298,9 @@ class GroundSegmenter:
         for view in self._views(left):
             if view.is_whole and mirror_share(view.plane, scan) >= MIRRORED:
                 # Again, without the images that were lowest in their cells.
-                near = left._replace(candidates=near_to(view.plane, left.candidates))
+                c = left.candidates
+                off = np.abs(view.plane.below(c.x, c.y, c.z))
+                near = left._replace(candidates=c.where(off < 2.0 * tolerance_at(c.r)))
                 return (self._look(near) or view)._replace(is_mirror=True)
         return below
 

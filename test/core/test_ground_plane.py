@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from gp_ground_seg.core.compiled import ground_plane as compiled
 from gp_ground_seg.core.frame import Candidates
 from gp_ground_seg.core.pipeline import ground_plane
-from gp_ground_seg.core.pipeline.ground_plane import MIN_CELLS, N_SECTORS, solve_plane
+from gp_ground_seg.core.pipeline.ground_plane import MIN_CELLS, solve_plane
 
 
 def random_candidates(seed, n_segments, n_bins, share):
@@ -37,7 +37,6 @@ def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
     for a, b in zip(*found, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
         assert 0.0 < a.support <= 1.0
-        assert a.n_support <= N_SECTORS * ground_plane.N_RINGS
 
 
 def test_floor_at_the_foot_of_a_wall_lies_on_the_plane_of_the_floor():
@@ -84,8 +83,8 @@ def test_backends_agree_on_the_score_of_a_plane(seed, share):
 @pytest.mark.parametrize('backend', BACKENDS, ids=lambda b: b.name)
 def test_no_plane(backend):
     few = random_candidates(0, 1, 40, 1.0).first(MIN_CELLS - 1)
-    few = few._replace(offsets=np.array([0, MIN_CELLS - 1]))
     above = random_candidates(1, 90, 20, 1.0)
+    few = few._replace(offsets=np.array([0, MIN_CELLS - 1]))
     assert list(backend.find_planes(few, 0.5)) == []
     assert next(backend.find_planes(above, 0.5)).n_support > 0
     # Nothing lies where the ground may be.

@@ -116,7 +116,7 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
     ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
     cell = (candidates.segment[near] * N_SECTORS // n_segments) * N_RINGS + ring
-    order = np.lexsort((z[near], cell))
+    order = np.argsort(cell + z[near] / (4.0 * MAX_Z), kind='stable')
     near, cell = near[order], cell[order]
     k = N_TOGETHER - 1
     low, high = near[:-k], near[k:]
@@ -126,17 +126,10 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     lowest, is_alone = near[first], np.ones(len(first), dtype=np.bool_)
     place = np.searchsorted(cell[first], cell[together])
     lowest[place], is_alone[place] = near[together], False
-    return cells_of(candidates, cell[first], lowest, near[first], is_alone)
-
-
-def cells_of(
-    candidates: Candidates, cell: IntArray, chosen: IntArray, lowest: IntArray, is_alone: BoolArray
-) -> LowestPoints:
-    """Lowest points of cells: the indices of the `chosen` ones, and of the lowest of all."""
-    x, y, z, r = candidates.x[chosen], candidates.y[chosen], candidates.z, candidates.r[chosen]
+    x, y, r = candidates.x[lowest], candidates.y[lowest], r[lowest]
     weight = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
     inverse = 1.0 / tolerance_at(r)
-    return LowestPoints(x, y, z[chosen], r, inverse, weight, cell, z[lowest], is_alone)
+    return LowestPoints(x, y, z[lowest], r, inverse, weight, cell[first], z[near[first]], is_alone)
 
 
 @shared
@@ -283,19 +276,13 @@ def set_hypotheses(cells: LowestPoints, max_slope: float, planes: FloatArray) ->
         else:
             i, j, k = SPREAD[t - n_level] * n
             plane = plane_through(cells, int(i), int(j), int(k))
-            if is_possible(plane, max_slope):
-                height, slope_x, slope_y = refined(cells, plane, max_slope, N_FIRST)
-                plane = in_grains(height), in_grains(slope_x), in_grains(slope_y)
         if is_possible(plane, max_slope):
-            planes[n_planes, 0], planes[n_planes, 1], planes[n_planes, 2] = plane
+            if t >= n_level:
+                plane = refined(cells, plane, max_slope, N_FIRST)
+            for axis in range(3):
+                planes[n_planes, axis] = math.floor(plane[axis] / GRAIN + 0.5) * GRAIN
             n_planes += 1
     return n_planes
-
-
-@shared
-def in_grains(value: float) -> float:
-    """Round to `GRAIN`."""
-    return math.floor(value / GRAIN + 0.5) * GRAIN
 
 
 def other_levels(best: Plane, cells: LowestPoints, is_left: BoolArray) -> FloatArray:
@@ -538,5 +525,6 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundP
 
 def is_new(sector: IntArray) -> BoolArray:
     """Which cells are the nearest of a sector: they come sector by sector, from near to far."""
-    result: BoolArray = np.diff(sector, prepend=-1) != 0
+    result = np.ones(len(sector), dtype=np.bool_)
+    np.not_equal(sector[1:], sector[:-1], out=result[1:])
     return result

@@ -36,8 +36,6 @@ N_ASIDE = 4
 WET_SHARE, WET_REACH = 0.1, 20.0
 """Candidates deep below the plane for each on it, both up to this range [m], from which they are
 asked for what they are images of."""
-ENOUGH = 400
-"""Candidates that are asked, at least, if there are so many."""
 COUNTERPART = 0.2
 """Side of the boxes in which a counterpart is looked for: its own and those around it [m]."""
 MIRRORED = 0.4
@@ -79,10 +77,9 @@ def find_mirror_images(scan: Scan, pose: SensorPose, view: View | None) -> Mirro
     grid, plane_z = scan.grid, -pose.sensor_height
     if not pose.starts_rays or plane_z >= 0.0:
         return NO_IMAGES
-    if view is None or not (view.is_mirror and pose.height_estimated):
-        is_dry = view is not None and not (view.is_mirror or view.may_be_image)
-        if is_dry or mirror_share(GroundPlane(pose.sensor_height), scan) < MIRRORED:
-            return NO_IMAGES
+    is_mirror = view is not None and view.is_mirror and pose.height_estimated
+    if not is_mirror and mirror_share(GroundPlane(pose.sensor_height), scan) < MIRRORED:
+        return NO_IMAGES
     inside = np.flatnonzero(grid.inside)
     r, z = grid.r[inside].astype(np.float64), scan.xyz[inside, 2].astype(np.float64)
     slope, cell = slope_of_sight(r, z), grid.cell[inside].astype(np.int64)
@@ -121,7 +118,6 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     is_on_it = near & (np.abs(over) <= tolerance_at(candidates.r))
     if len(deep) <= WET_SHARE * np.count_nonzero(is_on_it):
         return 0.0
-    deep = deep[:: 1 + len(deep) // ENOUGH]
     place = np.column_stack([candidates.x[deep], candidates.y[deep], candidates.z[deep]])
     normal, tile = plane.normal, candidates.tile[deep]
     raised = place - (2.0 * over[deep] * normal[2])[:, None] * normal
@@ -156,12 +152,6 @@ def in_sight(candidates: Candidates) -> Candidates:
     tells = np.flatnonzero((candidates.r >= NEAREST) & (slope < 0.0))
     nearer = _nearer_about(slope[tells], cell[tells], shape, 1)[cell]
     return candidates.where((slope < 0.0) & (slope >= nearer))
-
-
-def near_to(plane: GroundPlane, candidates: Candidates) -> Candidates:
-    """Candidates within two tolerances of a plane."""
-    off = np.abs(plane.below(candidates.x, candidates.y, candidates.z))
-    return candidates.where(off < 2.0 * tolerance_at(candidates.r))
 
 
 def slope_of_sight(r: FloatArray, z: FloatArray) -> FloatArray:
