@@ -264,6 +264,7 @@ def test_many_cells_tell_the_tilt_among_more_of_other_things():
     view = View(GroundPlane(1.8, support=0.3, coverage=0.7, spread=0.2, n_support=80), UPRIGHT)
     assert view.can_level
     assert not view._replace(plane=view.plane._replace(n_support=40)).can_level
+    assert not view._replace(plane=view.plane._replace(undercut=0.6)).can_level  # a hillside
 
 
 @pytest.mark.parametrize('sensor', [SMALL_VLP, SMALL_OS1], ids=lambda s: s.name)

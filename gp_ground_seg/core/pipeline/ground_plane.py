@@ -167,13 +167,10 @@ class GroundPlane(NamedTuple):
     # share of the sectors with any cell whose nearest is clearly over it, and below the sensor
     overhung: float = 0.0
     n_support: int = 0  # how many cells lie on it
+    # how many lie clearly below it, but alone, over these: none where things stand on a road
+    undercut: float = 0.0
     # as `height`, of the parallel level with the next best score [m]; infinite if there is none
     other_height: float = math.inf
-
-    @property
-    def depth(self) -> float:
-        """Mean number of cells that lie on it, one behind the other, of the sectors with any."""
-        return self.n_support / (self.coverage * N_SECTORS)
 
     def below(self, x: FloatArray | float, y: FloatArray | float, z: FloatArray | float) -> Any:
         """How far below points it is, along z [m]."""
@@ -494,6 +491,7 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundP
     height, sector, inverse = plane[0], cells.cell // N_RINGS, cells.inverse
     d, is_first = distance(cells.x, cells.y, cells.z, plane), is_new(sector)
     is_over = (d * inverse > CLEARLY_OFF) & (cells.z < 0.0) & is_first
+    is_below = (d * inverse < -CLEARLY_OFF) & ~cells.is_alone
     # Floor at the foot of a wall lies alone.
     is_off, lowest = np.abs(d * inverse) > 1.0, distance(cells.x, cells.y, cells.lowest_z, plane)
     d, z = np.where(is_off, lowest, d), np.where(is_off, cells.lowest_z, cells.z)
@@ -519,6 +517,7 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundP
         spread=float(drop[many] - drop[few]),
         overhung=np.count_nonzero(is_over) / np.count_nonzero(is_first),
         n_support=n,
+        undercut=np.count_nonzero(is_below) / n,
         other_height=other_height,
     )
 
