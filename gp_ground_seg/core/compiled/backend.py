@@ -44,7 +44,7 @@ class NumbaBackend:
     """The stages of `gp_ground_seg.core.backend.NumpyBackend`, compiled."""
 
     name = 'numba'
-    fit_plane = staticmethod(ground_plane.fit_plane)
+    find_planes = staticmethod(ground_plane.find_planes)
     extract_lines = staticmethod(partial(find_lines, trace_lines=jit(entry=True)(trace)))
     learn_frame = staticmethod(partial(learn_frame, fit=jit(entry=True)(fit_theta)))
     estimate_surface = staticmethod(partial(estimate_surface, fit=jit(entry=True)(fit_surfaces)))
