@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
@@ -259,6 +260,7 @@ class Diagnostics:
         self.input = InputTask(time.monotonic(), source)
         self.processing = ProcessingTask()
         self._newest: Segmentation | None = None  # its statistics are computed for a report only
+        self._last_line = time.monotonic()  # of the log on the clouds so far
         self._node, self._config = node, config
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         period = config.diagnostics.period
@@ -276,15 +278,16 @@ class Diagnostics:
         self, scan: Segmentation, arrival: float, stages: Mapping[str, float], age: float | None
     ) -> None:
         """Count the cloud that came at `arrival` [s], as in `processed`; log its stages."""
-        logger, backend = self._node.get_logger(), scan.fit.backend
-        times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
-        logger.debug(f'times of the stages [ms]: {times}')
+        logger = self._node.get_logger()
+        if logger.is_enabled_for(LoggingSeverity.DEBUG):
+            times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
+            logger.debug(f'times of the stages [ms]: {times}')
         if self._newest is None:
             logger.info(
                 f'first cloud: frame {self.input.frame!r}, {len(scan.label)} points, sensor '
-                f'{scan.pose.sensor_height:.2f} m over the ground, segmented with {backend}'
+                f'{scan.pose.sensor_height:.2f} m over the ground, segmented with {scan.backend}'
             )
-        self.processing.processed(time.monotonic() - arrival, backend, stages, age)
+        self.processing.processed(time.monotonic() - arrival, scan.backend, stages, age)
         self._newest = scan
 
     def summary(self) -> str:
@@ -301,13 +304,10 @@ class Diagnostics:
         ]
         array, node_name = DiagnosticArray(), self._node.get_fully_qualified_name()
         array.header.stamp = now.to_msg()
-        said = '; '.join(f'{own.task} {own.level.name}: {own.message}' for own in statuses)
-        self._node.get_logger().info(
-            f'so far: {self.summary()}; {said}',
-            skip_first=True,
-            throttle_duration_sec=LOG_PERIOD,
-            throttle_time_source_type=STEADY_CLOCK,
-        )
+        if time.monotonic() > self._last_line + LOG_PERIOD:
+            self._last_line = time.monotonic()
+            said = '; '.join(f'{own.task} {own.level.name}: {own.message}' for own in statuses)
+            self._node.get_logger().info(f'so far: {self.summary()}; {said}')
         for status in statuses:
             message = DiagnosticStatus(
                 level=bytes([status.level]),

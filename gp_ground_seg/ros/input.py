@@ -211,7 +211,7 @@ class CloudSubscription:
             if (kind := fault.split()[0]) not in self._logged:
                 self._logged.add(kind)
                 self._node.get_logger().warning(f'on {self.topic}, {fault}')
-        self._review_soon.trigger()
+        self.review()
 
     def review(self) -> None:
         """Subscribe as the publishers offer, or not at all, as clouds are wanted now; log it."""
