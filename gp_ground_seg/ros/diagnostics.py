@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
@@ -93,17 +92,16 @@ class InputTask:
             self._listening_since = now
         while self._arrivals and now - self._arrivals[0] > RATE_WINDOW:
             self._arrivals.popleft()
-        n_events = len(self._arrivals)
-        span = self._arrivals[-1] - self._arrivals[0] if n_events else 0.0
+        span = self._arrivals[-1] - self._arrivals[0] if self._arrivals else 0.0
         # The first event opens the span over which the others are counted.
-        rate = (n_events - 1) / span if span > 0.0 else None
+        rate = (len(self._arrivals) - 1) / span if span > 0.0 else None
         age = None if self._stamp is None else ros_time - self._stamp
         values = {
             'Topic': self._source.topic,
             'Publishers': str(self._source.n_publishers),
             'QoS': self._source.qos_words,
             'Events since startup': str(self._n_arrived),
-            'Events in window': str(n_events),
+            'Events in window': str(len(self._arrivals)),
             'Duration of window (s)': f'{span:.3f}',
             'Actual frequency (Hz)': _digits(rate, '.2f'),
             'Time since last cloud (s)': f'{now - self._last_arrival:.3f}',
@@ -122,13 +120,11 @@ class InputTask:
         if source.idle:
             return Level.OK, f'not listening to {source.topic}: {source.idle}'
         if silence > stale_after:
-            n = source.n_publishers
-            senders = f'publishers: {n}' if n else 'nobody sends clouds'
-            said = f'no cloud on {source.topic} for {silence:.1f} s ({senders})'
+            said = f'no cloud on {source.topic} for {silence:.1f} s ({source.senders})'
             return Level.STALE, f'{said}; {source.fault}' if source.fault else said
         if n_refused := self._n_refused_recent:
-            every = n_refused == n_received
-            share = 'every cloud' if every else f'{n_refused} of {n_received} clouds'
+            some = f'{n_refused} of {n_received} clouds'
+            share = 'every cloud' if n_refused == n_received else some
             return Level.ERROR, f'{share} refused: {self._last_error}'
         if source.fault:
             return Level.WARN, source.fault
@@ -227,7 +223,7 @@ def _faults_of(scan: Segmentation) -> list[str]:
     if faults:
         return faults
     if not scan.fit.n_segments:
-        return ['no ground found in the newest cloud']
+        return ['no ground found in the newest cloud: is z up, and sensor.height right?']
     is_failed = scan.fit.status == 'failed'
     return ['the hyper-parameters could not be learned'] if is_failed else []
 
@@ -260,7 +256,7 @@ class Diagnostics:
         self.input = InputTask(time.monotonic(), source)
         self.processing = ProcessingTask()
         self._newest: Segmentation | None = None  # its statistics are computed for a report only
-        self._last_line = time.monotonic()  # of the log on the clouds so far
+        self._last_line = time.monotonic() - 0.9 * LOG_PERIOD  # the first line of the log is early
         self._node, self._config = node, config
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         period = config.diagnostics.period
@@ -279,9 +275,8 @@ class Diagnostics:
     ) -> None:
         """Count the cloud that came at `arrival` [s], as in `processed`; log its stages."""
         logger = self._node.get_logger()
-        if logger.is_enabled_for(LoggingSeverity.DEBUG):
-            times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
-            logger.debug(f'times of the stages [ms]: {times}')
+        times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
+        logger.debug(f'times of the stages [ms]: {times}')
         if self._newest is None:
             logger.info(
                 f'first cloud: frame {self.input.frame!r}, {len(scan.label)} points, sensor '

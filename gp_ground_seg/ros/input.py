@@ -26,9 +26,6 @@ MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
 LARGE_CLOUD = 500_000  # size up to which stock Fast DDS loses no best-effort cloud [bytes]
 JUMP_TOLERANCE = 0.5  # stamps of several sensors on a topic may be so far out of order [s]
-NOTHING_ARRIVES = (
-    'qos_overrides asks for reliable, and a publisher offers best effort: nothing arrives from it'
-)
 AGE_WINDOW = 10  # clouds over which the median of their age is taken
 MAX_AGE = 1.0  # age of a cloud when it is sent from which on its stamp is of another clock [s]
 NO_TIME = (
@@ -106,14 +103,28 @@ class CloudSubscription:
     @property
     def qos_words(self) -> str:
         """Quality of service in use, as in ``reliable, keep_last 5, volatile``."""
-        history, durability = self._profile.history, self._profile.durability
-        words = f'{self._reliability.name}, {history.name} {self._profile.depth}'
-        return f'{words}, {durability.name}'.lower()
+        profile, history = self._profile, f'{self._profile.history.name} {self._profile.depth}'
+        return f'{self._reliability.name}, {history}, {profile.durability.name}'.lower()
 
     @property
     def n_publishers(self) -> int:
         """Number of publishers of clouds, when last counted."""
         return len(self._offered)
+
+    @property
+    def senders(self) -> str:
+        """How many publishers of clouds there are; where else clouds are sent, if none."""
+        if self._offered:
+            return f'publishers: {self.n_publishers}'
+        node = self._node
+        own = node.get_publisher_names_and_types_by_node(node.get_name(), node.get_namespace())
+        others = [
+            topic
+            for topic, types in node.get_topic_names_and_types()
+            if types == [CLOUD_TYPE] and topic not in dict(own) and node.count_publishers(topic)
+        ]
+        where = f', but on {", ".join(others)}: remap points to one' if others else ''
+        return f'nobody sends clouds{where}'
 
     @property
     def fault(self) -> str:
@@ -136,7 +147,10 @@ class CloudSubscription:
             )
         is_refused = best_effort in self._offered.values()
         if is_refused and self._profile.reliability == ReliabilityPolicy.RELIABLE:
-            yield NOTHING_ARRIVES
+            yield (
+                'qos_overrides asks for reliable, and a publisher offers best effort: nothing '
+                'arrives from it; set best_effort, or no reliability'
+            )
         if clock.ros_time_is_active and not clock.now().nanoseconds:
             yield NO_TIME
         age = median(self._ages) if self._ages else 0.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from copy import copy
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,8 +47,7 @@ horizontal range of the knot in the level frame, and, equal in all points, the a
 cloud's frame into the level one, and the place of the sensor in it."""
 OUTPUT_DEPTH = 20  # messages kept: Fast DDS may send a lost fragment again after 0.7 s only
 MAP_LIFESPAN = 0.9  # a grid for a reader that comes later has been sent so long ago at most [s]
-LONGEST_PERIOD = 1.0
-"""Time between two clouds [s] from which on some are missing: ``scan_time`` is 0 then."""
+LONGEST_PERIOD = 1.0  # between clouds; from it on some are missing, and ``scan_time`` is 0 [s]
 
 
 class Output(NamedTuple):
@@ -187,19 +187,14 @@ class OutputPublishers:
     _stamp = math.inf  # of the last cloud [s]
 
     def __init__(self, node: Node) -> None:
-        # A reader that asks for more than is offered says so itself: without events waits are short.
-        events = PublisherEventCallbacks(use_default_callbacks=False)
-        options = {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
-        self._publishers = [
-            # A copy: rclpy writes qos_overrides of this node into it.
-            (
-                o,
-                node.create_publisher(
-                    o.message_type, o.topic, copy(o.profile), event_callbacks=events, **options
-                ),
-            )
-            for o in OUTPUTS
-        ]
+        made = partial(
+            node.create_publisher,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            # Each is looked at in every wait; a reader that asks for too much says so itself.
+            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+        )
+        # A copy of the profile: rclpy writes qos_overrides of this node into it.
+        self._publishers = [(o, made(o.message_type, o.topic, copy(o.profile))) for o in OUTPUTS]
 
     def n_subscribers(self) -> dict[str, int]:
         """Return the number of subscribers of each topic."""
