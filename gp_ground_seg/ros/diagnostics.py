@@ -115,7 +115,7 @@ class InputTask:
         return Status('input', *self._judge(now, limits.stale_after), values)
 
     def _judge(self, now: float, stale_after: float) -> tuple[Level, str]:
-        source, n_received = self._source, self._n_recent
+        source, n = self._source, self._n_recent
         silence = now - max(self._last_arrival, self._listening_since)
         if source.idle:
             return Level.OK, f'not listening to {source.topic}: {source.idle}'
@@ -123,13 +123,11 @@ class InputTask:
             said = f'no cloud on {source.topic} for {silence:.1f} s ({source.senders})'
             return Level.STALE, f'{said}; {source.fault}' if source.fault else said
         if n_refused := self._n_refused_recent:
-            some = f'{n_refused} of {n_received} clouds'
-            share = 'every cloud' if n_refused == n_received else some
+            share = 'every cloud' if n_refused == n else f'{n_refused} of {n} clouds'
             return Level.ERROR, f'{share} refused: {self._last_error}'
         if source.fault:
             return Level.WARN, source.fault
-        waiting = f'waiting for the first cloud on {source.topic}'
-        return Level.OK, 'receiving' if n_received else waiting
+        return Level.OK, 'receiving' if n else f'waiting for the first cloud on {source.topic}'
 
 
 class ProcessingTask:

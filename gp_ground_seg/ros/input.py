@@ -96,8 +96,7 @@ class CloudSubscription:
         # The executor still uses a subscription within its own event; a guard condition runs
         # after all that became ready with it.
         self._review_soon = node.create_guard_condition(self.review)
-        # The event can come before the publisher is listed, and there is no event for the end
-        # of the last best-effort publisher: they are looked at every second too.
+        # The event can come before the publisher is listed, and there is none for its end.
         node.create_timer(1.0, self._every_second, clock=STEADY_CLOCK)
 
     @property
@@ -114,17 +113,14 @@ class CloudSubscription:
     @property
     def senders(self) -> str:
         """How many publishers of clouds there are; where else clouds are sent, if none."""
-        if self._offered:
-            return f'publishers: {self.n_publishers}'
+        if n := self.n_publishers:
+            return f'publishers: {n}'
         node = self._node
         own = node.get_publisher_names_and_types_by_node(node.get_name(), node.get_namespace())
-        others = [
-            topic
-            for topic, types in node.get_topic_names_and_types()
-            if types == [CLOUD_TYPE] and topic not in dict(own) and node.count_publishers(topic)
-        ]
-        where = f', but on {", ".join(others)}: remap points to one' if others else ''
-        return f'nobody sends clouds{where}'
+        every = node.get_topic_names_and_types()
+        clouds = [name for name, types in every if CLOUD_TYPE in types and name not in dict(own)]
+        others = ', '.join(filter(node.count_publishers, clouds))
+        return 'nobody sends clouds' + (others and f', but on {others}: remap points to one')
 
     @property
     def fault(self) -> str:

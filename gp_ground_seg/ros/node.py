@@ -52,8 +52,7 @@ from gp_ground_seg.ros.transforms import (
     is_tf_used,
 )
 
-# Time between heartbeats [s], as in Nav2's newer nodes: at 0.1 s they wake the node as often as
-# its clouds. The manager connects after the first, and waits half of its bond_timeout for it.
+# Time between heartbeats [s], as in Nav2's newer nodes; the manager waits half of its bond_timeout.
 BOND_PERIOD = 0.25
 BOND_TIMEOUT = 4.0  # without a heartbeat the node counts as dead [s]: the manager's default
 BOND_DEPTH = 5

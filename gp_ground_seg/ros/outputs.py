@@ -34,7 +34,6 @@ from gp_ground_seg.data.point_cloud2 import (
     read_xyz,
     select_points,
 )
-from gp_ground_seg.ros.input import stamp_of
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
@@ -47,7 +46,6 @@ horizontal range of the knot in the level frame, and, equal in all points, the a
 cloud's frame into the level one, and the place of the sensor in it."""
 OUTPUT_DEPTH = 20  # messages kept: Fast DDS may send a lost fragment again after 0.7 s only
 MAP_LIFESPAN = 0.9  # a grid for a reader that comes later has been sent so long ago at most [s]
-LONGEST_PERIOD = 1.0  # between clouds; from it on some are missing, and ``scan_time`` is 0 [s]
 
 
 class Output(NamedTuple):
@@ -184,8 +182,6 @@ OUTPUTS = (
 class OutputPublishers:
     """Publishers of all outputs of `node`."""
 
-    _stamp = math.inf  # of the last cloud [s]
-
     def __init__(self, node: Node) -> None:
         made = partial(
             node.create_publisher,
@@ -202,14 +198,10 @@ class OutputPublishers:
 
     def publish(self, segmented: SegmentedCloud) -> None:
         """Publish all outputs of a cloud, or none if one cannot be built."""
-        seconds = 1e-9 * stamp_of(segmented.cloud.header)
-        period, self._stamp = seconds - self._stamp, seconds
         messages = [
             (publisher, output.build(segmented))
             for output, publisher in self._publishers
             if not output.is_optional or publisher.get_subscription_count() > 0
         ]
         for publisher, message in messages:
-            if isinstance(message, LaserScan):
-                message.scan_time = period if 0.0 < period < LONGEST_PERIOD else 0.0
             publisher.publish(message)
