@@ -52,7 +52,7 @@ from gp_ground_seg.ros.transforms import (
     is_tf_used,
 )
 
-# Time between heartbeats [s], as in Nav2's newer nodes; the manager waits half of its bond_timeout.
+# Time between heartbeats [s], as in newer Nav2; its manager waits half of bond_timeout for one.
 BOND_PERIOD = 0.25
 BOND_TIMEOUT = 4.0  # without a heartbeat the node counts as dead [s]: the manager's default
 BOND_DEPTH = 5
