@@ -122,7 +122,12 @@ class SegmentedCloud:
 
     @cached_property
     def edges(self) -> FloatArray:
-        """Points along the edges of drops, (n, 3) in the frame of the cloud [m]."""
+        """Points along the edges of drops, (n, 3) in the frame of the cloud [m].
+
+        Where ``output.max_step_down`` is 0, none are looked for.
+        """
+        if self.config.output.max_step_down == 0.0:
+            return np.empty((0, 3))
         return self._in_cloud(self._found.points())
 
     @cached_property

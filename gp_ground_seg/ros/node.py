@@ -52,8 +52,9 @@ from gp_ground_seg.ros.transforms import (
     is_tf_used,
 )
 
-# Time between heartbeats [s], as in newer Nav2; its manager waits half of bond_timeout for one.
-BOND_PERIOD = 0.25
+# Time between heartbeats [s], the same as in Nav2's own nodes: the manager connects after the
+# first, and waits half of its bond_timeout for one.
+BOND_PERIOD = 0.1
 BOND_TIMEOUT = 4.0  # without a heartbeat the node counts as dead [s]: the manager's default
 BOND_DEPTH = 5
 LAST_WORDS = Duration(seconds=0.5)  # longest wait until the end of a bond is delivered

@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from copy import copy
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -34,6 +32,7 @@ from gp_ground_seg.data.point_cloud2 import (
     read_xyz,
     select_points,
 )
+from gp_ground_seg.ros.input import stamp_of
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
@@ -46,6 +45,8 @@ horizontal range of the knot in the level frame, and, equal in all points, the a
 cloud's frame into the level one, and the place of the sensor in it."""
 OUTPUT_DEPTH = 20  # messages kept: Fast DDS may send a lost fragment again after 0.7 s only
 MAP_LIFESPAN = 0.9  # a grid for a reader that comes later has been sent so long ago at most [s]
+LONGEST_PERIOD = 1.0
+"""Time between two clouds [s] from which on some are missing: ``scan_time`` is 0 then."""
 
 
 class Output(NamedTuple):
@@ -182,15 +183,15 @@ OUTPUTS = (
 class OutputPublishers:
     """Publishers of all outputs of `node`."""
 
+    _stamp = math.inf  # of the last cloud [s]
+
     def __init__(self, node: Node) -> None:
-        made = partial(
-            node.create_publisher,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            # Each is looked at in every wait; a reader that asks for too much says so itself.
-            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
-        )
-        # A copy of the profile: rclpy writes qos_overrides of this node into it.
-        self._publishers = [(o, made(o.message_type, o.topic, copy(o.profile))) for o in OUTPUTS]
+        options = {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
+        self._publishers = [
+            # A copy: rclpy writes qos_overrides of this node into it.
+            (o, node.create_publisher(o.message_type, o.topic, copy(o.profile), **options))
+            for o in OUTPUTS
+        ]
 
     def n_subscribers(self) -> dict[str, int]:
         """Return the number of subscribers of each topic."""
@@ -198,10 +199,14 @@ class OutputPublishers:
 
     def publish(self, segmented: SegmentedCloud) -> None:
         """Publish all outputs of a cloud, or none if one cannot be built."""
+        seconds = 1e-9 * stamp_of(segmented.cloud.header)
+        period, self._stamp = seconds - self._stamp, seconds
         messages = [
             (publisher, output.build(segmented))
             for output, publisher in self._publishers
             if not output.is_optional or publisher.get_subscription_count() > 0
         ]
         for publisher, message in messages:
+            if isinstance(message, LaserScan):
+                message.scan_time = period if 0.0 < period < LONGEST_PERIOD else 0.0
             publisher.publish(message)

@@ -379,6 +379,7 @@ def test_off_nothing_is_looked_for(monkeypatch):
     off = segmented(drop(6.0, 0.6), MOUNTED['hdl-64e'], **{'output.max_step_down': 0.0})
     monkeypatch.setattr(costmap, 'find_edges', None)
     assert Config().output.max_step_down == 0.0
+    assert off.edges.shape == (0, 3)
     for place, obstacle in zip(off.blocked, off.places(off.is_obstacle), strict=True):
         np.testing.assert_array_equal(place, obstacle)
 

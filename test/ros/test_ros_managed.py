@@ -84,13 +84,13 @@ def test_a_lifecycle_manager_hears_a_bond_while_the_node_is_active(link):
 
     def is_regular():
         times = [one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec for one in heard.messages]
-        return len(times) > 2 and np.median(np.diff(times)) == pytest.approx(0.25, abs=0.05)
+        return len(times) > 2 and np.median(np.diff(times)) == pytest.approx(0.1, abs=0.05)
 
     for n in (1, 2):
         heard.messages.clear()
         change(link, ACTIVATE)
         # Nav2's manager waits half of its bond_timeout for the first that it hears.
-        wait_for(is_regular, 'heartbeat every 0.25 s')
+        wait_for(is_regular, 'heartbeat every 0.1 s')
         change(link, DEACTIVATE)
         wait_for(lambda: not heard.messages[-1].active, 'end of the bond')
         *beats, end = heard.messages
@@ -98,7 +98,7 @@ def test_a_lifecycle_manager_hears_a_bond_while_the_node_is_active(link):
         assert {one.id for one in heard.messages} == {NODE_NAME}
         instances |= {one.instance_id for one in heard.messages}
         assert len(instances) == n
-        assert end.heartbeat_period == pytest.approx(0.25) and end.heartbeat_timeout == 4.0
+        assert end.heartbeat_period == pytest.approx(0.1) and end.heartbeat_timeout == 4.0
     assert 'bond_timeout' not in link.process.log
 
 

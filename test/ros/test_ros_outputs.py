@@ -153,6 +153,16 @@ def test_what_a_costmap_takes_is_that_of_the_library(b):
     np.testing.assert_array_equal(cells, costmap.occupancy(*places, reach, 0.25, 30.0))
 
 
+def test_the_time_of_a_scan_is_that_between_clouds(b):
+    collector = b.listen('~/scan', LaserScan)
+    for n, stamp in enumerate([(100, 0), (100, 10**8), (105, 0)], 1):
+        b.segment(to_message(street(500), stamp))
+        collector.wait(n)
+    b.forget(collector)
+    # After a pause it says nothing.
+    assert [scan.scan_time for scan in collector.messages[1:]] == pytest.approx([0.1, 0.0])
+
+
 def test_nothing_is_built_that_nobody_subscribes_to(b, monkeypatch):
     built = []
 
