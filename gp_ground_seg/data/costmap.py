@@ -4,8 +4,6 @@ Places are two arrays x and y, (n,) each, in the plane of the map [m]; direction
 equal sectors, counter-clockwise from -x.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The three tasks on /diagnostics; ``now`` is a time of a steady clock [s]."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The input: clouds of one topic as their publishers offer them, losses, time jumps."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import deque

@@ -1,7 +1,5 @@
 """The numba backend: each stage as a few calls of compiled functions."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

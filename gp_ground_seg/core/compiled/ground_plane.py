@@ -1,7 +1,5 @@
 """Loops of `gp_ground_seg.core.pipeline.ground_plane` for compiled code."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

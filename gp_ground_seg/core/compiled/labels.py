@@ -3,8 +3,6 @@
 Tables of tiles have one row more, for points in no tile.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ Of the tiles to examine, the returns are summed, the lowest and those above apar
 tell which tiles show no ground. Coordinates are rounded so that the sums are exact in any order.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

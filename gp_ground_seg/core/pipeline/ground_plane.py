@@ -1,7 +1,5 @@
 """Stage 2: the plane of the ground around the sensor, from the lowest points of one scan."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple

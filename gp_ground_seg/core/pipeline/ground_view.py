@@ -1,7 +1,5 @@
 """Stage 2: what a plane of a scan tells: the height, the tilt, or that z is not up."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Stage 6: labels from the height of each point over the surface, and p_ground."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

@@ -8,8 +8,6 @@ above it. Images that are raised again to what they are images of are no ground.
 Where images are the lowest returns of most cells, the plane of the ground is looked for past them.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

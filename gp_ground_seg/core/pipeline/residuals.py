@@ -25,8 +25,6 @@ The spread of few cells is itself uncertain: errors over it follow Student's dis
 variance of the ground about the corrected surface is that, and that of the mean, ``W / n``.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

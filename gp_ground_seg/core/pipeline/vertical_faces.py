@@ -10,8 +10,6 @@ Terrain is smooth: the returns of a tile lie on a plane. Those of a bush or of s
 Raised tiles are no ground either where many around them scatter more than the own level does.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gp_ground_seg.core.frame import (
