@@ -28,7 +28,7 @@ class NumpyBackend:
 
     name = 'numpy'
     build_grid = staticmethod(polar_grid.build_scan)
-    fit_plane = staticmethod(ground_plane.fit_plane)
+    find_planes = staticmethod(ground_plane.find_planes)
     find_faces = staticmethod(vertical_faces.find_faces)
     find_relief = staticmethod(relief.find_relief)
     extract_lines = staticmethod(lines.find_lines)

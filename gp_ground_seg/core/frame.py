@@ -176,6 +176,7 @@ class Scan(NamedTuple):
     grid: PolarGrid  # cells of the points
     tiles: Tiles  # tiles of the points
     candidates: Candidates  # lowest point of each occupied cell
+    extent: FloatArray  # (M * n_bins,) height of each cell's points [m]; -inf where there is none
 
 
 class Faces(NamedTuple):

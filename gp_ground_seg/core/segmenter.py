@@ -9,7 +9,8 @@ import math
 import os
 import textwrap
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
 from numbers import Real
 from pathlib import Path
 from time import perf_counter
@@ -24,6 +25,7 @@ from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_
 from gp_ground_seg.core.gp.learning import Learned
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.parameters.schema import NO_BOX
+from gp_ground_seg.core.pipeline.ground_plane import tolerance_at
 from gp_ground_seg.core.pipeline.ground_view import (
     LOWER_ENDS,
     MAX_TILT,
@@ -37,7 +39,6 @@ from gp_ground_seg.core.pipeline.ground_view import (
 )
 from gp_ground_seg.core.pipeline.mirror_images import (
     MIRRORED,
-    NO_IMAGES,
     MirrorImages,
     find_mirror_images,
     in_sight,
@@ -60,6 +61,9 @@ from gp_ground_seg.core.pipeline.sensor_pose import (
     with_fallback,
 )
 from gp_ground_seg.core.result import Segmentation
+
+MOST_PLANES = 4
+"""Planes of a scan that are looked at for one that may be the ground, or a mirror."""
 
 
 class GroundSegmenter:
@@ -254,15 +258,10 @@ class GroundSegmenter:
         """
         backend, config, given = self._backend, self._config, given_pose(sensor)
         about = moved(xyz, given.origin)
-        level, elsewhere = given.level(about), None
+        level = given.level(about)
         scan = backend.build_grid(level, config)
         timer.mark('grid')
-        below, seen = self._past_images(scan, self._look(scan))
-        view = self._find_ground(level, below) if is_doubtful(below) else below
-        if view is not None and not view.can_level:
-            # The scan will not be levelled: the ground that matters is about level.
-            elsewhere = view if view.tells_tilt else None
-            view = self._look(seen, max_tilt=CLEAR_TILT) or below
+        view, elsewhere = self._find_ground(level, scan)
         objection = objection_to_ground(scan, view)
         pose = estimate_pose(sensor, None if objection else view, elsewhere, objection)
         if fallback is not None:
@@ -274,37 +273,39 @@ class GroundSegmenter:
         if objection == LOWER_ENDS and pose.is_height_default:
             nothing = np.zeros(len(scan.candidates.r), dtype=np.bool_)
             scan = scan._replace(candidates=scan.candidates.where(nothing))
-        is_dry = below is not None and not (below.is_mirror or below.may_be_image)
-        images = NO_IMAGES if is_dry else find_mirror_images(scan, pose)
+        images = find_mirror_images(scan, pose, view)
         if len(images.points) > 0:
             scan = images.left_out(backend.build_grid(images.raised(scan.xyz), config))
         timer.mark('pose')
         return scan, pose, images, config
 
-    def _past_images(self, scan: Scan, below: View | None) -> tuple[View | None, Scan]:
-        """View of a mirror: by the candidates that are no images of it, if these show one.
+    def _find_ground(self, level: PointArray, scan: Scan) -> tuple[View | None, View | None]:
+        """View of the ground, and where it clearly lies if that is too far from z."""
+        below = self._past_images(scan, self._look(scan))
+        view = self._about_axes(level, below) if is_doubtful(below) else below
+        if view is None or view.can_level:
+            return view, None
+        # The scan will not be levelled: the ground that matters is about level.
+        return self._look(scan, max_tilt=CLEAR_TILT) or below, view if view.tells_tilt else None
 
-        Else `below`, and the scan as it is.
-        """
+    def _past_images(self, scan: Scan, below: View | None) -> View | None:
+        """View of a mirror, if candidates that are no images of it show one; else `below`."""
         if below is not None:
             below = below._replace(is_mirror=mirror_share(below.plane, scan) >= MIRRORED)
             if not (below.is_mirror or below.may_be_image):
-                return below, scan
+                return below
         left = scan._replace(candidates=in_sight(scan.candidates))
-        view = self._look(left)
-        if view is not None and view.is_whole and mirror_share(view.plane, scan) >= MIRRORED:
-            return view._replace(is_mirror=True), left
-        return below, scan
+        for view in self._views(left):
+            if view.is_whole and mirror_share(view.plane, scan) >= MIRRORED:
+                # Again, without the images that were lowest in their cells.
+                c = left.candidates
+                off = np.abs(view.plane.below(c.x, c.y, c.z))
+                near = left._replace(candidates=c.where(off < 2.0 * tolerance_at(c.r)))
+                return (self._look(near) or view)._replace(is_mirror=True)
+        return below
 
-    def _look(
-        self, scan: Scan, turn: FloatArray = UPRIGHT, max_tilt: float = MAX_TILT
-    ) -> View | None:
-        """Plane of a scan that `turn` has rotated, unless it is a ceiling."""
-        plane = self._backend.fit_plane(scan.candidates, math.tan(max_tilt))
-        return None if plane is None or is_ceiling(plane, scan) else View(plane, turn)
-
-    def _find_ground(self, xyz: PointArray, below: View | None) -> View | None:
-        """Plane of the ground, about z or another axis; that `below` z is doubtful."""
+    def _about_axes(self, xyz: PointArray, below: View | None) -> View | None:
+        """View of the ground about z or another axis; that `below` z is doubtful."""
         sample = xyz[:: len(xyz) // ENOUGH_POINTS + 1]
 
         def look(turn: FloatArray) -> View | None:
@@ -316,6 +317,25 @@ class GroundSegmenter:
             return below
         first = map(look, OTHER_AXES)
         return clearest(below, [look(view.levelled) if view else None for view in first])
+
+    def _look(
+        self, scan: Scan, turn: FloatArray = UPRIGHT, max_tilt: float = MAX_TILT
+    ) -> View | None:
+        """Best plane of a scan that may be ground, or without one the best that is no ceiling."""
+        views = self._views(scan, turn, max_tilt)
+        first = next(views, None)
+        if first is None or first.tells_height:
+            return first
+        return next((view for view in views if view.tells_height), first)
+
+    def _views(
+        self, scan: Scan, turn: FloatArray = UPRIGHT, max_tilt: float = MAX_TILT
+    ) -> Iterator[View]:
+        """Yield planes of a scan that `turn` has rotated, but ceilings, the best first."""
+        planes = self._backend.find_planes(scan.candidates, math.tan(max_tilt))
+        for plane in islice(planes, MOST_PLANES):
+            if not is_ceiling(plane, scan):
+                yield View(plane, turn)
 
 
 def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[float, ...]:

@@ -4,8 +4,6 @@ Places are two arrays x and y, (n,) each, in the plane of the map [m]; direction
 equal sectors, counter-clockwise from -x.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -44,7 +42,6 @@ FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 
 # A plain integer: comparing with an enumeration is five times slower.
 _OBSTACLE = int(Label.OBSTACLE)
-_ROWS = 32  # rows of cells at a time: their arrays stay in the cache
 
 Ranges = npt.NDArray[np.float32]
 Places = tuple[PointArray, PointArray]
@@ -244,18 +241,12 @@ def occupancy(
     is what `Blocked` hides.
     """
     n_cells = math.ceil(grid_size / cell_size - 1e-6)
-    state = np.full((n_cells, n_cells), UNKNOWN, dtype=np.int8)
     direction, r = _cell_centres(n_cells, cell_size)
     nearest, farthest = ranges_of(*ground)
     until = np.minimum(np.minimum(farthest, ranges_of(*obstacles[:2])[0]), reach)
-    for rows in range(0, n_cells, _ROWS):
-        part = slice(rows, rows + _ROWS)
-        towards = direction[part]
-        is_passed = r[part] >= nearest.take(towards)
-        is_passed &= r[part] <= until.take(towards)
-        state[part][is_passed] = FREE
+    is_passed = (r >= nearest[direction]) & (r <= until[direction])
     # Places beyond the square fall into a border of one cell.
-    bordered = np.pad(state, 1)
+    bordered = np.pad(np.where(is_passed, FREE, UNKNOWN).astype(np.int8), 1)
     for places, value in ((ground, FREE), (obstacles[:2], OCCUPIED)):
         column, row = (
             np.fmin(np.fmax(along / cell_size + (0.5 * n_cells + 1.0), 0.0), n_cells + 1.0)

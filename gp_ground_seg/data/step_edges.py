@@ -135,9 +135,10 @@ class _Returns(NamedTuple):
 
 
 class _Steps(NamedTuple):
-    """Steps down from a return to the next one."""
+    """Steps down from a return to the next one, or to where the ground is no longer steep."""
 
     upper: IntArray  # (S,) last return before the step
+    lower: IntArray  # (S,) return at its end
     sector: IntArray  # (S,)
     near: FloatArray  # (S,) range of the last return before it [m]
     fall: FloatArray  # (S,) height that the ground falls, less its roughness [m]
@@ -174,7 +175,7 @@ def find_edges(
     """
     edges = Edges.none(len(xyz))
     returns = _sort(xyz, is_ground, stands, height)
-    steps = _steps(returns, *_falls(returns), max_step_down)
+    steps = _steps(returns, *_falls(returns, max_step_down), max_step_down)
     every, hiding = np.arange(SECTORS), steps.where(~steps.is_on_slope)
     _hide(edges, returns, hiding, max_step_down)
     # Where the first return is behind a fall, and its line of sight less steep than a ramp.
@@ -240,8 +241,8 @@ def _hide(edges: Edges, returns: _Returns, steps: _Steps, max_step_down: float) 
     """Enter what lies behind `steps`, which no slope explains, until the level is seen again."""
     z, r = returns.z, returns.r
     starts = np.searchsorted(returns.sector, np.arange(SECTORS + 1))
-    for upper, sector in zip(steps.upper, steps.sector, strict=True):
-        lower, depth = upper + 1, z[upper] - z[upper + 1]
+    for upper, lower, sector in zip(steps.upper, steps.lower, steps.sector, strict=True):
+        depth = z[upper] - z[lower]
         if depth < min(LEAST_HIDDEN * returns.sight[lower], WEAK * max_step_down):
             continue
         start, behind = starts[sector], slice(lower, starts[sector + 1])
@@ -274,24 +275,37 @@ def _sort(xyz: FloatArray, is_ground: BoolArray, stands: BoolArray, height: floa
     return _Returns(kept, sector[order], r, ground | is_level, stood & ~is_level, z, -z / r)
 
 
-def _falls(returns: _Returns) -> tuple[IntArray, FloatArray]:
-    """Last returns of the ground before falls of more than `LEAST_FALL`, and slopes of the falls.
+def _falls(returns: _Returns, max_step_down: float) -> tuple[IntArray, IntArray, FloatArray]:
+    """Last returns of the ground before falls, returns at their end, and slopes of the falls.
 
-    Each ends at the next return. Its slope is positive, and not much less than that of the line of
-    sight.
+    They end at the next return, or, as on stairs nearby, where a steep way down exceeds the limit.
+    Slopes are positive, and not much less than those of the lines of sight.
     """
     sector, z, r = returns.sector, returns.z, returns.r
     is_fall = (sector[1:] == sector[:-1]) & returns.is_ground[:-1] & ~returns.stands[1:]
-    is_fall &= (z[:-1] - z[1:] > LEAST_FALL) & (r[1:] > r[:-1]) & (r[:-1] < REACH)
-    upper = np.flatnonzero(is_fall)
-    slope = (z[upper] - z[upper + 1]) / (r[upper + 1] - r[upper])
+    is_fall &= (r[1:] > r[:-1]) & (r[:-1] < REACH)
+    end, begin = np.arange(len(r)), np.flatnonzero(is_fall)
+    while len(begin):
+        last = np.minimum(end[begin] + 1, len(r) - 1)
+        goes_on = (
+            (sector[last] == sector[begin]) & (last > end[begin]) & ~returns.stands[last]
+            & (z[begin] - z[last] > MAX_SLOPE * (r[last] - r[begin]))
+            & (z[begin] - z[end[begin]] <= max_step_down)
+        )  # fmt: skip
+        end[begin := begin[goes_on]] += 1
+    is_steep = z - z[end] > max_step_down
+    end = np.where(is_steep, end, np.arange(len(r)) + 1)
+    upper = np.flatnonzero(is_fall & (is_steep[:-1] | (z[:-1] - z[1:] > LEAST_FALL)))
+    slope = (z[upper] - z[end[upper]]) / (r[end[upper]] - r[upper])
     kept = (slope > LEAST_SHARE * returns.sight[upper + 1]) | (r[upper] == FOOT)
     if kept.any():
         kept &= ~_is_mirrored(returns, upper)
-    return upper[kept], slope[kept]
+    return upper[kept], end[upper[kept]], slope[kept]
 
 
-def _steps(returns: _Returns, upper: IntArray, slope: FloatArray, max_step_down: float) -> _Steps:
+def _steps(
+    returns: _Returns, upper: IntArray, deep: IntArray, slope: FloatArray, max_step_down: float
+) -> _Steps:
     """Falls that are larger than the roughness allows, those from the foot than the limit."""
     sector, z, r = returns.sector, returns.z, returns.r
     lower, ground, is_first = upper + 1, _Ground.of(returns), r[upper] == FOOT
@@ -321,9 +335,10 @@ def _steps(returns: _Returns, upper: IntArray, slope: FloatArray, max_step_down:
     leads_back &= top > z[upper] - max_step_down
     is_on_slope = np.where(is_first, leads_back, runs_down | goes_on) & (slope < MAX_SLOPE)
 
-    fall = np.minimum(z[upper], level) - z[lower] - N_ROUGHNESS * roughness
-    fall = np.where(is_first, z[upper] - z[lower], fall)
-    steps = _Steps(upper, sector[upper], r[upper], fall, returns.sight[lower], is_on_slope)
+    fall = np.minimum(z[upper], level) - z[deep] - N_ROUGHNESS * roughness
+    fall = np.where(is_first, z[upper] - z[deep], fall)
+    sight = returns.sight[lower]
+    steps = _Steps(upper, deep, sector[upper], r[upper], fall, sight, is_on_slope)
     return steps.where(fall > np.where(is_first, max_step_down, LEAST_FALL))
 
 

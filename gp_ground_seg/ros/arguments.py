@@ -1,7 +1,5 @@
 """Command line of a ROS process, and the parameter files that it names."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import itertools

@@ -24,7 +24,7 @@ STAYS = 'segmenting with numpy from now on'
 JOIN_TIMEOUT = 0.5  # longest wait for the thread [s]
 
 PROCESSES = 'learn_frame', 'estimate_surface'
-OTHERS = 'fit_plane', 'find_faces', 'find_relief', 'extract_lines', 'label_points'
+OTHERS = 'find_planes', 'find_faces', 'find_relief', 'extract_lines', 'label_points'
 """Stages of a frame after the grid, of which the first take as long to compile as the others. They
 share the growth of inliers, which one process compiles once."""
 # Collecting garbage less often, as the commands do, saves a tenth of the time.

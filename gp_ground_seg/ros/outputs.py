@@ -1,7 +1,5 @@
 """The output topics: an `Output` for each makes a message from a segmented cloud."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from copy import copy

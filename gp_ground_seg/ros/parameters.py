@@ -1,7 +1,5 @@
 """The parameters of `gp_ground_seg.core.parameters.config` as ROS parameters of a node."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Iterable
 from typing import Any

@@ -4,8 +4,6 @@ Functions import ROS, which takes half a second, themselves: signals are noted m
 commands import this module where there is no ROS.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Tilt and place of the sensor at the stamp of a cloud: by TF, an IMU, or an earlier cloud."""
 
-from __future__ import annotations
-
 import importlib
 import struct
 import time

@@ -28,7 +28,7 @@ def place_of(x, y, grid):
 
 
 def lowest_of_cells(scan, config):
-    """Lowest point of each cell; of equally low ones the nearest, first by tile, then by place.
+    """Lowest point of each cell; of equally low ones the nearest, then the first by place.
 
     The density is the mean over three slices of equal height of points over area.
     """
@@ -39,7 +39,7 @@ def lowest_of_cells(scan, config):
     for cell, own in sorted(members.items()):
         z = scan.xyz[own, 2].astype(np.float64)
         x, y = scan.xyz[own, 0], scan.xyz[own, 1]
-        low, r, tile, x, y = min(zip(z, scan.grid.r[own], scan.tiles.tile[own], x, y, strict=True))
+        low, r, x, y, tile = min(zip(z, scan.grid.r[own], x, y, scan.tiles.tile[own], strict=True))
         segment, n = divmod(cell, scan.grid.n_bins)
         extent = max(max(z) - low, config.lines.min_density_extent)
         number = np.bincount(np.minimum((z - low) / extent * 3, 2).astype(int), minlength=3)

@@ -1,5 +1,7 @@
 """The plane of the ground near the sensor: both backends on clutter and on anything."""
 
+from itertools import islice
+
 import numpy as np
 import pytest
 from conftest import BACKENDS, fewer
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from gp_ground_seg.core.compiled import ground_plane as compiled
 from gp_ground_seg.core.frame import Candidates
 from gp_ground_seg.core.pipeline import ground_plane
-from gp_ground_seg.core.pipeline.ground_plane import MIN_CELLS, N_SECTORS, solve_plane
+from gp_ground_seg.core.pipeline.ground_plane import MIN_CELLS, solve_plane
 
 
 def random_candidates(seed, n_segments, n_bins, share):
@@ -31,29 +33,22 @@ def random_candidates(seed, n_segments, n_bins, share):
 @given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.integers(0, 40), st.floats(0.0, 1.0))
 def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
     candidates = random_candidates(seed, n_segments, n_bins, share)
-    a, b = (backend.fit_plane(candidates, 0.577) for backend in BACKENDS)
-    assert (a is None) == (b is None)
-    if a is not None:
+    found = (list(islice(backend.find_planes(candidates, 0.577), 3)) for backend in BACKENDS)
+    for a, b in zip(*found, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
-        assert 0.0 < a.support <= 1.0
-        assert a.n_support <= N_SECTORS * ground_plane.N_RINGS
 
 
 def test_floor_at_the_foot_of_a_wall_lies_on_the_plane_of_the_floor():
     """Of its cells, one point is floor, and nine are wall."""
-    m, r = (
-        grid.ravel()
-        for grid in np.meshgrid(np.arange(180), np.arange(2.0, 6.0, 0.5), indexing='ij')
-    )
-    z = np.where(r < 5.0, -1.0, -0.5)
-    z[(r == 5.0) & (m % 5 == 0)] = -1.0
+    m, r = np.repeat(np.arange(180), 8), np.tile(np.arange(2.0, 6.0, 0.5), 180)
+    z = np.where((r < 5.0) | ((r == 5.0) & (m % 5 == 0)), -1.0, -0.5)
     zero, offsets = np.zeros(len(r), np.int32), np.arange(181) * 8
     x_y = r * (np.cos(m * np.pi / 90.0), np.sin(m * np.pi / 90.0))
     candidates = Candidates(r, z, zero.astype(np.int64), 1.0 + zero, offsets, zero, *x_y)
     cells = ground_plane.lowest_points(candidates)
     assert (cells.z == -0.5).sum() == 36 and (cells.lowest_z == -1.0).all()
     for backend in BACKENDS:
-        plane = backend.fit_plane(candidates, 0.5)
+        plane = next(backend.find_planes(candidates, 0.5))
         assert plane.height == pytest.approx(1.0, abs=1e-6)
         assert plane.n_support == len(cells.z)
 
@@ -76,23 +71,22 @@ def test_backends_agree_on_the_score_of_a_plane(seed, share):
         return
     k = planes.tolist().index(list(best))
     np.testing.assert_allclose((score, support), (scores.max(), supports[k]), rtol=1e-12)
-    assert scores[k] == pytest.approx(scores.max(), rel=1e-12)
     assert ground_plane.best_of(planes, cells, score)[1] == 0.0
 
 
 @pytest.mark.parametrize('backend', BACKENDS, ids=lambda b: b.name)
 def test_no_plane(backend):
     few = random_candidates(0, 1, 40, 1.0).first(MIN_CELLS - 1)
-    assert backend.fit_plane(few._replace(offsets=np.array([0, MIN_CELLS - 1])), 0.5) is None
     above = random_candidates(1, 90, 20, 1.0)
-    assert backend.fit_plane(above, 0.5) is not None
+    few = few._replace(offsets=np.array([0, MIN_CELLS - 1]))
+    assert list(backend.find_planes(few, 0.5)) == []
+    assert next(backend.find_planes(above, 0.5)).n_support > 0
     # Nothing lies where the ground may be.
-    assert backend.fit_plane(above._replace(z=np.full(len(above.z), 6.0)), 0.5) is None
+    assert list(backend.find_planes(above._replace(z=np.full(len(above.z), 6.0)), 0.5)) == []
 
 
 def test_moments_that_determine_no_plane_or_no_slope():
     before = 1.5, 0.1, -0.2
     assert solve_plane((0.0,) * 9, before) == before
-    x, y = 2.0, 3.0
-    one = 1.0, x, y, x * x, x * y, y * y, -1.0, -x, -y
-    assert solve_plane(one, before) == pytest.approx((1.0 + 0.1 * x - 0.2 * y, 0.1, -0.2))
+    one = 1.0, 2.0, 3.0, 4.0, 6.0, 9.0, -1.0, -2.0, -3.0
+    assert solve_plane(one, before) == pytest.approx((1.0 + 0.2 - 0.6, 0.1, -0.2))

@@ -42,6 +42,20 @@ def labels_of(backend, points):
     return backend.label_points(scan, Faces.none(scan.tiles), surface, LEVEL, 1.0, config)
 
 
+@pytest.mark.parametrize('nearest', [5.0, 5.2])
+def test_ground_before_a_wall_is_ground_where_its_cell_is_flat(backend, nearest):
+    """It rises more within the tile than the foot of a face, or lies in the plane of the wall."""
+    x = np.concatenate([np.linspace(nearest, 5.24, 100), np.full(100, 5.26)])
+    z = np.concatenate([0.35 * (x[:100] - 5.0), np.linspace(0.11, 0.9, 100)])
+    points, is_ground = np.stack([x, np.tile([0.01, 0.02], 100), z], axis=-1), x < 5.25
+    config = CONFIG.replace(**{'grid.n_bins': 32, 'label.rule': 'tolerance'})
+    scan, mean = backend.build_grid(points, config), np.zeros((4, 33))
+    surface = GroundSurface(scan.grid.edges, mean, mean, np.ones(0, dtype=bool))
+    faces = backend.find_faces(scan, 0.0, config)
+    found = backend.label_points(scan, faces, surface, LEVEL, 1.0, config)
+    np.testing.assert_array_equal(found.label == Label.GROUND, is_ground)
+
+
 @pytest.mark.parametrize('std', [0.0, 0.03])
 @pytest.mark.parametrize('size', [0.4, 1.0, 2.0])
 def test_a_thing_on_the_ground_is_no_roughness(backend, std, size):
@@ -80,7 +94,7 @@ def test_probability_is_a_half_at_the_edge_and_follows_the_certainty():
 def test_backends_give_the_same_labels(compiled_code, seed, dtype):
     rng = np.random.default_rng(seed)
     xyz = rng.uniform(-12, 12, (300, 3)).astype(dtype)
-    xyz[:, 2] *= 0.1
+    xyz[:, 2] *= rng.choice([0.01, 0.1])
     # Posts, so that there are faces.
     places = np.repeat(rng.uniform(-6, 6, (5, 2)), 20, axis=0)
     xyz[100:200, :2] = places + rng.normal(0, 0.02, (100, 2))

@@ -11,7 +11,7 @@ from reference import extract_lines, pseudo_inputs
 
 from gp_ground_seg import Config
 from gp_ground_seg.core.frame import Candidates, Faces
-from gp_ground_seg.core.gp.ground import carries_on
+from gp_ground_seg.core.gp.ground import carries_on, slope_before
 from gp_ground_seg.core.pipeline.lines import (
     deming_slope,
     differs_in_direction,
@@ -123,10 +123,20 @@ def test_the_ground_carries_on_to_a_slope_and_not_to_a_step(backend, ahead, is_f
     candidates = candidates_of(5.0 + 4.0 * np.arange(7), np.append(np.zeros(3), ahead))
     _, lines, _, onward, _ = backend.extract_lines(candidates, NO_FACES, Config())
     assert list(lines.start) == [0, 3, 7]
-    follows = is_walkable(ahead[0], 4.0, 0.2) and carries_on(ahead[0], 4.0, onward[3], np.nan)
+    rises_on = carries_on(ahead[0], 4.0, onward[3], np.nan)
+    follows = is_walkable(ahead[0], 4.0, 0.2) and (ahead[0] <= 0.0 or rises_on)
     assert follows == is_followed
+    # Where it falls, nothing shows that what is there is ground.
+    assert not (rises_on and ahead[0] <= 0.0)
     assert np.isnan(onward[5:]).all() == is_walkable(ahead[3] - ahead[2], 4.0, 0.2)
     assert carries_on(0.4, 4.0, onward[6], 0.1) > carries_on(0.4, 4.0, onward[6], 0.05)
+
+
+def test_a_line_tells_the_ground_as_far_ahead_as_it_reaches_back():
+    growth = Config().growth
+    extent = np.array([growth.min_rise_extent, 20.0, 20.0, 0.9 * growth.min_rise_extent])
+    told = slope_before(0.1, extent, np.array([1.0, 20.0, 20.1, 1.0]), growth)
+    np.testing.assert_array_equal(told, [0.1, 0.1, np.nan, np.nan])
 
 
 def test_a_candidate_far_below_changes_no_line_of_other_segments(backend):

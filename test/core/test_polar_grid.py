@@ -23,6 +23,7 @@ def config_of(cell_size=0.5, **grid):
 def assert_same_scan(found, expected):
     np.testing.assert_array_equal(found.grid.cell, expected.grid.cell)
     np.testing.assert_array_equal(found.grid.r, expected.grid.r)
+    np.testing.assert_array_equal(found.extent, expected.extent)
     # Backends number the tiles in another order.
     tiles, others = found.tiles, expected.tiles
     inside = tiles.tile != OUTSIDE

@@ -23,7 +23,8 @@ from gp_ground_seg import Config
 from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.core.pipeline import sensor_pose
-from gp_ground_seg.core.pipeline.ground_view import LOWER_ENDS
+from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
+from gp_ground_seg.core.pipeline.ground_view import LOWER_ENDS, UPRIGHT, View
 from gp_ground_seg.core.pipeline.sensor_pose import (
     LITTLE_GROUND,
     LOW_GROUND,
@@ -228,14 +229,16 @@ def test_a_sensor_that_looks_ahead_stands_on_the_level_that_ends_there(edge, dro
         assert pose.measured.plane.other_height == pytest.approx(1.7 - drop, abs=0.1)
 
 
-JETTY = landforms.polyline(1.3, [(-2.0, -1.5), (-1.7, 0.0), (1.7, 0.0), (2.0, -1.5)])
+JETTY = landforms.polyline(np.pi / 2, [(-2.0, -1.5), (-1.7, 0.0), (1.7, 0.0), (2.0, -1.5)])
+RAILS = tuple(floating_box(JETTY, 0.0, y, (40.0, 0.1, 0.08), 0.92) for y in (-1.6, 1.6))
 UPWARDS = tuple(np.radians(np.linspace(52, -52, 64)))
 NEAR = [
     # Floors under a ceiling, also the little that is seen of a small room, and among desks.
     *((HALL, *one, 0, 0.05) for one in ((VLP_16, 0.4), (OS1_128, 0.5), (HDL_64E, 1.73))),
     (SMALL_ROOM, simulation.SENSORS['mid-360'], 0.45, 0, 0.05),
     (desks(2.4), dataclasses.replace(SMALL_OS1, elevations=UPWARDS), 0.95, 0, 0.05),
-    # A narrow jetty is the ground, and cars around are not.
+    # A narrow jetty is the ground; rails beside the sensor, and cars around, are not.
+    (Scene('rails', JETTY, RAILS), simulation.SENSORS['mid-360'], 1.0, 0, 0.05),
     *(
         (scene, sensor, height + more, 3, 0.05)
         for sensor, height in ((SMALL_VLP, 0.5), (SMALL_VLP, 1.0), (SMALL_OS1, 0.8))
@@ -255,6 +258,13 @@ def test_the_ground_is_that_near_the_sensor(scene, sensor, height, seed, toleran
     pose = pose_of(scan_of(scene, sensor, height, seed=seed).points)
     assert pose.height_estimated and pose.is_level
     assert pose.height == pytest.approx(height, abs=tolerance)
+
+
+def test_many_cells_tell_the_tilt_among_more_of_other_things():
+    view = View(GroundPlane(1.8, support=0.3, coverage=0.7, spread=0.2, n_support=80), UPRIGHT)
+    assert view.can_level
+    assert not view._replace(plane=view.plane._replace(n_support=40)).can_level
+    assert not view._replace(plane=view.plane._replace(undercut=0.6)).can_level  # a hillside
 
 
 @pytest.mark.parametrize('sensor', [SMALL_VLP, SMALL_OS1], ids=lambda s: s.name)

@@ -9,7 +9,12 @@ from conftest import hilly_scan
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.core.frame import GroundSurface, Labelled, PolarGrid
 from gp_ground_seg.core.pipeline import residuals
-from gp_ground_seg.core.pipeline.residuals import LEAST_STD, PRIOR_CELLS, correct_surface
+from gp_ground_seg.core.pipeline.residuals import (
+    HIDDEN,
+    LEAST_STD,
+    PRIOR_CELLS,
+    correct_surface,
+)
 from gp_ground_seg.lab.simulation import DRIVES, SENSORS, simulate_scan
 
 N_SEGMENTS = 7
@@ -44,7 +49,10 @@ def test_the_correction_by_hand():
     # Behind the third cell none is seen; the nearest knot that is lies 3 m away, 0.1 m lower.
     apart = (slope_std * (KNOTS[5] - KNOTS[4])) ** 2
     weight = own**2 / (2.0 * own**2 + apart)
-    variance = own**2 + apart + weight * (1.0 - weight) * 0.1**2
+    seen = np.zeros(mean.shape, bool)
+    seen[:2, :2] = seen[4, 3:5] = True
+    slope = residuals._slope_variance(found.mean, seen, KNOTS, slope_std)
+    variance = own**2 + weight * (1.0 - weight) * 0.1**2 + slope[4, 4] * (HIDDEN * 3.0) ** 2
     unseen = third.mean() - weight * 0.1, np.sqrt(variance), np.sqrt(variance + noise**2)
     np.testing.assert_allclose(values[4, 5], unseen, atol=1e-6)
     np.testing.assert_array_equal(np.isnan(found.mean), np.isnan(mean))
@@ -124,3 +132,14 @@ def test_of_two_knots_as_near_rounding_does_not_choose(n_segments, monkeypatch):
         again, other = residuals._nearest(knots, seen, ~seen)
         np.testing.assert_array_equal(other, nearest)
         np.testing.assert_allclose(again, distance, rtol=1e-9)
+
+
+def test_slopes_are_of_neighbours_that_are_seen_and_of_the_prior_without_any():
+    knots, rise = np.arange(2.0, 42.0), np.where(np.arange(90) < 45, 0.0, 0.2)
+    height = rise[:, None] * knots
+    seen = np.ones(height.shape, dtype=np.bool_)
+    seen[:, 30:] = False
+    slope = np.sqrt(residuals._slope_variance(height, seen, knots, 0.05))
+    np.testing.assert_allclose(slope[20, :20], 0.0, atol=2e-3)
+    assert (slope[65, 8:20] > 0.1).all() and (slope[65] <= 0.2).all()
+    np.testing.assert_allclose(slope[:, -1], 0.05, atol=1e-12)

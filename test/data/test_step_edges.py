@@ -30,6 +30,8 @@ MOUNTED['os1-64'] = dataclasses.replace(
     range_std=0.02,
     height=0.8,
 )
+DOWN = tuple(np.radians(np.linspace(45.0, -45.0, 64)).tolist())
+MOUNTED['os0-64'] = dataclasses.replace(MOUNTED['os1-64'], elevations=DOWN)
 MIDDLE = (np.arange(SECTORS) + 0.5) * (2.0 * np.pi / SECTORS) - np.pi
 
 
@@ -328,6 +330,14 @@ def test_stairs_with_a_landing_are_no_ramp(at):
     ranges, cells = ranges_and_cells(polyline(0.0, corners), 'os1-64')
     assert not np.isposinf(ranges[AHEAD]).any()
     assert not (cells[:, int(10 * at) + 3 :] == costmap.FREE).any()
+
+
+@pytest.mark.parametrize('at', [0.75, 1.2])
+def test_stairs_of_which_each_step_is_seen_and_allowed_are_a_drop(at):
+    corners = [(at + 0.29 * (k // 2), -0.17 * (k - k // 2)) for k in range(16)]
+    ranges, cells = ranges_and_cells(polyline(0.0, corners), 'os0-64')
+    assert np.isfinite(ranges[AHEAD]).mean() > 0.9
+    assert (cells[:, int(10 * at) + 3 : 20] == costmap.FREE).mean() < 0.05
 
 
 @pytest.mark.parametrize('name', LOW)

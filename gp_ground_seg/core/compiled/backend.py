@@ -1,7 +1,5 @@
 """The numba backend: each stage as a few calls of compiled functions."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
@@ -44,7 +42,7 @@ class NumbaBackend:
     """The stages of `gp_ground_seg.core.backend.NumpyBackend`, compiled."""
 
     name = 'numba'
-    fit_plane = staticmethod(ground_plane.fit_plane)
+    find_planes = staticmethod(ground_plane.find_planes)
     extract_lines = staticmethod(partial(find_lines, trace_lines=jit(entry=True)(trace)))
     learn_frame = staticmethod(partial(learn_frame, fit=jit(entry=True)(fit_theta)))
     estimate_surface = staticmethod(partial(estimate_surface, fit=jit(entry=True)(fit_surfaces)))
@@ -61,12 +59,10 @@ class NumbaBackend:
         at = np.full(n_places, OUTSIDE, np.int32)
         tiles = Tiles(tile, np.empty((n, 2), dtype), np.empty(n, np.int32), at)
         candidates = Candidates.buffers(n_segments * n_bins, n_segments)
-        min_extent = config.lines.min_density_extent
-        n, n_candidates = polar_grid.build_grid(
-            xyz.T, geometry, min_extent, grid, tiles, candidates
-        )
+        extent, least = np.empty(n_segments * n_bins), config.lines.min_density_extent
+        n, count = polar_grid.build_grid(xyz.T, geometry, least, grid, tiles, candidates, extent)
         tiles = tiles._replace(extremes=tiles.extremes[:n], place=tiles.place[:n])
-        return Scan(xyz, grid, tiles, candidates.first(n_candidates))
+        return Scan(xyz, grid, tiles, candidates.first(count), extent)
 
     def find_faces(self, scan: Scan, height: float, config: Config) -> Faces:
         """Tiles that show no ground."""

@@ -1,7 +1,5 @@
 """Compiled twin of `gp_ground_seg.core.gp.evidence`."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

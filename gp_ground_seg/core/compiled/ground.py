@@ -6,8 +6,6 @@ factorisation. Inliers join from near to far, mostly: columns nearer than the fi
 is no inlier need no more rows.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 
@@ -277,22 +275,22 @@ def _find_joining(
         if not has_inliers and columns.neighbour_precision[i] == 0.0:
             continue
         height, variance = _predict(i, columns)
-        joins, goes_on = fits(z[i], height, variance, noise, growth), False
+        joins, falls, is_shown = fits(z[i], height, variance, noise, growth), False, False
         if last >= 0:
             rise, distance = z[i] - z[last], r[c] - r[first + last]
             walkable = is_walkable(rise, distance, growth.max_slope)
             if walkable and not frame.in_face[c] and not columns.above[i]:
                 line = lines.line[first + last]
                 extent = r[first + last] - r[lines.start[line]]
-                before = slope_before(lines.slope[line], extent, growth)
-                goes_on = carries_on(rise, distance, frame.onward[c], before)
+                before = slope_before(lines.slope[line], extent, distance, growth)
+                is_shown, falls = carries_on(rise, distance, frame.onward[c], before), rise <= 0.0
             elif not joins:
                 last = -1  # it stands on the ground, which does not go on behind it
-        if joins and odds > 0.0 and not goes_on:
+        if joins and odds > 0.0 and not is_shown:
             columns.noise[i] = noise_in_doubt(
                 z[i], height, variance, columns.noise[i], frame.in_face[c], odds
             )
-        joins |= goes_on
+        joins |= is_shown or falls
         if joins:
             columns.new[n_new] = i
             n_new += 1

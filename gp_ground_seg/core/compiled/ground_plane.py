@@ -1,21 +1,18 @@
 """Loops of `gp_ground_seg.core.pipeline.ground_plane` for compiled code."""
 
-from __future__ import annotations
+from collections.abc import Iterator
 
 import numpy as np
 
-from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray
+from gp_ground_seg.core.frame import Candidates, FloatArray
 from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import (
     CLEARLY_OFF,
     LEAST_REACH,
-    MAX_Z,
-    MIN_CELLS,
     N_CELLS,
     N_RINGS,
     N_SECTORS,
-    N_TOGETHER,
     RING_EDGES,
     GroundPlane,
     Loops,
@@ -23,77 +20,29 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     Moments,
     Plane,
     best_of,
-    cells_of,
     crossing_of,
-    described,
     distance,
     levelness,
-    own_level,
+    lowest_points,
+    planes_of,
     refined,
     refutation_by,
     set_hypotheses,
     support_by,
-    tolerance_at,
     tukey_weight,
 )
 
 
-def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
-    """Do what `gp_ground_seg.core.pipeline.ground_plane.fit_plane` does, to rounding."""
-    indices, is_alone = np.empty((3, N_CELLS), np.int64), np.empty(N_CELLS, np.bool_)
-    n = _tabulate(candidates, indices, is_alone)
-    if n < MIN_CELLS:
-        return None
-    cell, chosen, lowest = indices[:, :n]
-    cells = cells_of(candidates, cell, chosen, lowest, is_alone[:n])
-    return described(cells, *own_level(cells, max_slope, _LOOPS))
+def find_planes(candidates: Candidates, max_slope: float) -> Iterator[GroundPlane]:
+    """Do what `gp_ground_seg.core.pipeline.ground_plane.find_planes` does, to rounding."""
+    return planes_of(lowest_points(candidates), max_slope, _LOOPS)
 
 
-_LOOPS = Loops(jit(entry=True)(set_hypotheses), jit(entry=True)(best_of), jit(entry=True)(refined))
-
-
-@jit(entry=True)
-def _tabulate(candidates: Candidates, indices: IntArray, is_alone: BoolArray) -> int:
-    """Set what `cells_of` takes; return the number of cells."""
-    offsets, r, z = candidates.offsets, candidates.r, candidates.z
-    n_segments = len(offsets) - 1
-    cell_of, starts = np.full(len(r), -1), np.zeros(N_CELLS + 1, np.int64)
-    for m in range(n_segments):
-        first = (m * N_SECTORS // n_segments) * N_RINGS
-        for c in range(offsets[m], offsets[m + 1]):
-            if RING_EDGES[0] <= r[c] < RING_EDGES[N_RINGS] and abs(z[c]) < MAX_Z:
-                cell_of[c] = first + np.searchsorted(RING_EDGES, r[c], side='right') - 1
-                starts[cell_of[c] + 1] += 1
-    starts = np.cumsum(starts)
-    # Candidates cell by cell, from low to high: few in each.
-    ends, members = starts[:N_CELLS].copy(), np.empty(starts[N_CELLS], np.int64)
-    for c in range(len(r)):
-        cell = cell_of[c]
-        if cell >= 0:
-            place = ends[cell]
-            while place > starts[cell] and z[members[place - 1]] > z[c]:
-                members[place] = members[place - 1]
-                place -= 1
-            members[place] = c
-            ends[cell] += 1
-    n = 0
-    for cell in range(N_CELLS):
-        if starts[cell] < ends[cell]:
-            own = members[starts[cell] : ends[cell]]
-            k = _lowest_together(r, z, own)
-            indices[0, n], indices[1, n], indices[2, n] = cell, own[max(k, 0)], own[0]
-            is_alone[n] = k < 0
-            n += 1
-    return n
-
-
-@jit()
-def _lowest_together(r: FloatArray, z: FloatArray, own: IntArray) -> int:
-    """Place of the lowest of candidates from low to high that is not alone, or -1."""
-    for k in range(len(own) - N_TOGETHER + 1):
-        if z[own[k + N_TOGETHER - 1]] - z[own[k]] <= tolerance_at(r[own[k]]):
-            return k
-    return -1
+_LOOPS = Loops(
+    jit(entry=True)(set_hypotheses),
+    jit(entry=True)(best_of),
+    jit(entry=True)(refined),
+)
 
 
 @compiled_form(ground_plane.supports_of)

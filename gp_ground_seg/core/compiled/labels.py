@@ -3,8 +3,6 @@
 Tables of tiles have one row more, for points in no tile.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -38,6 +36,7 @@ from gp_ground_seg.core.pipeline.labels import (
     whole_units,
 )
 from gp_ground_seg.core.pipeline.relief import height_in
+from gp_ground_seg.core.pipeline.vertical_faces import is_flat
 
 # Plain integers, as compiled code has no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
@@ -76,15 +75,19 @@ def label_points(
     near_tile, sums = _survey(scan, *tables, highest, units, shift, result.height)
     if by_roughness:
         set_roughness(scan.tiles, sums, faces.is_face, units, shift, roughness)
-    bands, tops = np.empty((2, n_tiles + 1), result.height.dtype)
+    bands, tops = np.empty(n_tiles + 1, number), np.full((2, n_tiles + 1), math.inf, number)
     for t in range(n_tiles + 1):
-        bands[t], tops[t] = ground_band(roughness[t], highest, config), math.inf
+        bands[t] = ground_band(roughness[t], highest, config)
         if faces.is_face[t]:
             low, is_occluded = np.float64(scan.tiles.extremes[t, 0]), faces.has_occluded_base[t]
-            tops[t] = top_of_face(roughness[t], low, is_occluded, config)
-    _label_by_bands(scan, bands, tops, number(depth), result)
+            tops[0, t] = top_of_face(roughness[t], low, is_occluded, config)
+            tops[1, t] = tops[0, t] if is_occluded else math.inf
+    _set_margins(scan, bands, tops, number(depth), config.ground_tolerance, result)
     if by_roughness:
-        _vote(scan, near_tile, lowest, config, result)
+        _vote(scan, near_tile, lowest, config, result.margin)
+    for i in range(len(result.label)):
+        otherwise = np.uint8(_UNKNOWN) if scan.grid.cell[i] == NOT_FINITE else np.uint8(_OBSTACLE)
+        result.label[i] = np.uint8(_GROUND) if result.margin[i] >= number(0.0) else otherwise
 
 
 @jit()
@@ -169,32 +172,27 @@ def _add_squares(
 
 
 @jit()
-def _label_by_bands(
-    scan: Scan, bands: PointArray, tops: PointArray, depth: float, result: Labelled
+def _set_margins(
+    scan: Scan, bands: PointArray, tops: PointArray, depth: float, tolerance: float, to: Labelled
 ) -> None:
-    """Label the points from their heights in `result`; `bands` and `tops` are those of tiles."""
-    z, tile, cell = scan.xyz[2], scan.tiles.tile, scan.grid.cell
-    height, label, margins = result.height, result.label, result.margin
-    last, zero = np.int32(len(bands) - 1), z.dtype.type(0.0)
+    """Set the margins of the points; `bands` and `tops`, also in flat cells, are of tiles."""
+    z, tile, cell, last = scan.xyz[2], scan.tiles.tile, scan.grid.cell, np.int32(len(bands) - 1)
     for i in range(len(tile)):
-        t = np.uintp(tile[i] if tile[i] >= 0 else last)
-        margins[i] = margin_of(height[i], z[i], bands[t], tops[t], depth)
-    # A loop of its own has vector instructions.
-    for i in range(len(cell)):
-        otherwise = np.uint8(_UNKNOWN) if cell[i] == NOT_FINITE else np.uint8(_OBSTACLE)
-        label[i] = np.uint8(_GROUND) if margins[i] >= zero else otherwise
+        t, c = np.uintp(tile[i] if tile[i] >= 0 else last), np.uintp(max(cell[i], np.int32(0)))
+        top = tops[1 if is_flat(scan.extent[c], tolerance) else 0, t]
+        to.margin[i] = margin_of(to.height[i], z[i], bands[t], top, depth)
 
 
 @jit()
 def _vote(
-    scan: Scan, near_tile: CellArray, lowest: float, config: LabelConfig, result: Labelled
+    scan: Scan, near_tile: CellArray, lowest: float, config: LabelConfig, margins: PointArray
 ) -> None:
-    """Change margins and labels of the returns near an obstacle by the mean votes about them.
+    """Change the margins of the returns near an obstacle by the mean votes about them.
 
     `lowest` is that of `lowest_of` [m].
     """
-    margins, tolerance = result.margin, config.ground_tolerance
-    has_obstacle, outside = np.zeros(len(scan.tiles.place) + 1, np.bool_), len(scan.tiles.place)
+    tolerance, outside = config.ground_tolerance, len(scan.tiles.place)
+    has_obstacle = np.zeros(outside + 1, np.bool_)
     for i in range(len(near_tile)):
         has_obstacle[np.uintp(near_tile[i] if margins[i] < 0.0 else outside)] = True
     has_obstacle[outside] = False
@@ -223,7 +221,6 @@ def _vote(
         number = total // VOTER_FLAG
         mean = (total - number * VOTER_FLAG) / number - VOTE_UNITS
         margins[i] = margin_after_vote(np.float64(margins[i]), mean * (tolerance / VOTE_UNITS))
-        result.label[i] = _GROUND if margins[i] >= 0.0 else _OBSTACLE
 
 
 @jit(part=True)

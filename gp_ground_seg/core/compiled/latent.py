@@ -1,7 +1,5 @@
 """Compiled twin of `gp_ground_seg.core.gp.latent`: the mean of the latent process."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Loops of `gp_ground_seg.core.gp.likelihood`, in which compiled code spends its time."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

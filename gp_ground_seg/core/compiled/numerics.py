@@ -5,8 +5,6 @@ taken by two unsigned indices: the references to a view of a row are counted, wh
 than a short row, and a signed index could count from the end.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Compiled twin of `gp_ground_seg.core.pipeline.polar_grid`."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -36,6 +34,7 @@ def build_grid(
     grid: PolarGrid,
     tiles: Tiles,
     candidates: Candidates,
+    extent: FloatArray,
 ) -> tuple[int, int]:
     """Sort points, (3, N), into cells and tiles, with the extremes of each.
 
@@ -64,7 +63,9 @@ def build_grid(
     for first in range(0, len(r), BLOCK):
         block = slice(first, min(first + BLOCK, len(r)))
         own = columns[:, block], r[block], cell[block], tile[block]
-        _resolve_lowest(*own, tiles.place, extremes, numbers)
+        _resolve_lowest(*own, extremes, numbers)
+    for k in range(n_cells):
+        extent[k] = np.float64(extremes[k, 2]) - np.float64(extremes[k, 0])
     return n_tiles, _take_candidates(extremes, numbers, geometry.edges, min_extent, candidates)
 
 
@@ -188,29 +189,18 @@ def _resolve_lowest(
     r: PointArray,
     cell: CellArray,
     tile: CellArray,
-    tile_places: CellArray,
     extremes: PointArray,
     numbers: CellArray,
 ) -> None:
     """Range, tile and place of the lowest point of each cell, once its height is known."""
-    outside = len(numbers) - 1
     x, y, z = columns[0], columns[1], columns[2]
-    # Listed in any case, counted only where it is the lowest: no branch to predict.
-    found = np.empty(BLOCK + 1, dtype=np.int64)
-    n_found = 0
     for i in range(len(z)):
-        k = np.uintp(cell[i] if cell[i] >= 0 else outside)
-        found[np.uintp(n_found)] = i
-        n_found += np.int64(z[i] == extremes[k, 0])
-    for i in found[:n_found]:
-        if cell[i] < 0:
-            continue
-        k = np.uintp(cell[i])
-        own = r[i], tile_places[tile[i]], x[i], y[i]
-        place = tile_places[max(numbers[k, 1], 0)]
-        if own < (extremes[k, 1], place, extremes[k, 3], extremes[k, 4]):
-            extremes[k, 1], numbers[k, 1] = r[i], tile[i]
-            extremes[k, 3], extremes[k, 4] = x[i], y[i]
+        k = np.uintp(cell[i] if cell[i] >= 0 else len(numbers) - 1)
+        if cell[i] >= 0 and z[i] == extremes[k, 0]:
+            own = r[i], x[i], y[i]
+            if own < (extremes[k, 1], extremes[k, 3], extremes[k, 4]):
+                extremes[k, 1], extremes[k, 3], extremes[k, 4] = own
+                numbers[k, 1] = tile[i]
 
 
 @jit()

@@ -3,8 +3,6 @@
 Tables of squares have one more at each side, so that each square has eight around it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gp_ground_seg.core.compiled.terrain import reachable

@@ -4,8 +4,6 @@ The tiles of a block, and of nine blocks, are counted by level in the bytes of `
 that one addition counts eight levels: nine blocks have at most 144 tiles.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

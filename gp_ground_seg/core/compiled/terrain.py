@@ -1,7 +1,5 @@
 """Compiled twin of `gp_ground_seg.core.pipeline.terrain`."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

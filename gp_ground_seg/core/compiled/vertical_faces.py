@@ -4,8 +4,6 @@ Of the tiles to examine, the returns are summed, the lowest and those above apar
 tell which tiles show no ground. Coordinates are rounded so that the sums are exact in any order.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -26,16 +24,16 @@ from gp_ground_seg.core.pipeline.vertical_faces import (
     is_base_occluded,
     is_beyond_edge,
     is_examined,
+    is_flat,
     is_steep,
     is_vertical,
     scatter_square,
     smooth_up_to,
 )
 
-# Each tall tile has two rows, for the lowest returns and for those above: their sums and the
-# greatest height. The first row also holds the origin of the tile.
-_TOP, _X, _Y, _BASE = SUMS, SUMS + 1, SUMS + 2, SUMS + 3
-N_COLUMNS = SUMS + 4
+# Each tall tile has two rows, for the lowest returns and for those above: their sums. The first
+# row also holds the origin of the tile.
+_X, _Y, _BASE, N_COLUMNS = SUMS, SUMS + 1, SUMS + 2, SUMS + 3
 
 
 @jit(entry=True)
@@ -46,17 +44,25 @@ def find_faces(
 
     Points are (3, N).
     """
-    tiles, candidates = scan.tiles, scan.candidates
+    tiles, candidates, n_bins = scan.tiles, scan.candidates, len(scan.grid.edges) - 1
+    shows_ground, tolerance = np.zeros(len(tiles.place), np.bool_), label.ground_tolerance
+    for m in range(len(candidates.offsets) - 1):
+        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            cell, t = m * n_bins + candidates.bin[c], candidates.tile[c]
+            is_foot = candidates.z[c] - np.float64(tiles.extremes[t, 0]) <= tolerance
+            shows_ground[t] |= is_foot and is_flat(scan.extent[cell], tolerance)
     tall, tile_to_row = _select_tall(tiles, height, label)
     sums = _sum_returns(scan.xyz, tiles, tall, config.cell_size, label, tile_to_row)
     square = np.empty(len(tall))
     for k in range(len(tall)):
         t, low, high = np.uintp(tall[k]), sums[2 * k], sums[2 * k + 1]
-        reaches = max(low[_TOP], high[_TOP]) > face_height(label)
+        extent = np.float64(tiles.extremes[t, 1]) - np.float64(tiles.extremes[t, 0])
+        reaches = extent > face_height(label)
         is_face = reaches and is_vertical(low, high, config)
         faces.is_face[t] = is_face
         faces.is_steep[t] = reaches and is_steep(high)
-        faces.has_occluded_base[t] = is_face and is_base_occluded(low, high, config)
+        is_occluded = is_face and not shows_ground[t] and is_base_occluded(low, high, config)
+        faces.has_occluded_base[t] = is_occluded
         square[k] = UNKNOWN if is_face else scatter_square(low, high)
     _mark_scattered(tiles, tall, square, height, label, faces)
     for m in range(len(candidates.offsets) - 1):
@@ -153,5 +159,4 @@ def _sum_returns(
         s[7] += dx * dy
         s[8] += dx * dz
         s[9] += dy * dz
-        s[_TOP] = max(s[_TOP], above)
     return sums

@@ -6,8 +6,6 @@ must not stand higher than seeds near them allow, and the surfaces of the segmen
 with a segment's own which candidates join.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Stage 5: the observation process: inlier growth, and the surface of every segment."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -257,7 +255,6 @@ def grow_inliers(
     above = contradicts(*beside, z, gate_noise)
     lines = frame.lines
     extent = candidates.r - candidates.r[lines.start[lines.line]]
-    slope = slope_before(lines.slope[lines.line], extent, model.growth)
     found.inlier[:], found.doubt[:] = False, 0.0
     for segments in batches(np.arange(0, candidates.n_segments, step), candidates.offsets):
         layout = Padded.of(segments, candidates.offsets)
@@ -273,7 +270,8 @@ def grow_inliers(
             mask,
             (found.seed & ~above)[place] & mask,
             layout.take(frame.onward, -np.inf),
-            slope[place],
+            lines.slope[lines.line[place]],
+            extent[place],
             frame.in_face[place],
             above[place],
             Evidence(layout.take(beside.height), layout.take(beside.precision)),
@@ -297,7 +295,8 @@ class _Batch(NamedTuple):
     mask: BoolArray  # (S, n)
     seed: BoolArray  # (S, n)
     onward: FloatArray  # (S, n)
-    slope_before: FloatArray  # (S, n)
+    slope: FloatArray  # (S, n) that of its line
+    extent: FloatArray  # (S, n) how far its line reaches back
     in_face: BoolArray  # (S, n)
     above: BoolArray  # (S, n) the evidence contradicts it
     from_neighbours: Evidence  # (S, n)
@@ -330,10 +329,10 @@ def _grow(batch: _Batch, growth: GrowthConfig, odds: float) -> BoolArray:
         # Before anything has joined, only the evidence of neighbours decides.
         may_join = ~chosen & batch.mask
         may_join &= chosen.any(axis=1, keepdims=True) | (batch.from_neighbours.precision > 0.0)
-        on_slope = _on_slope(batch, chosen, fitting, growth)
+        on_slope, is_shown = _on_slope(batch, chosen, fitting, growth)
         if odds > 0.0:
             doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, batch.in_face, odds)
-            batch.noise[:] = np.where(may_join & fitting & ~on_slope, doubtful, batch.noise)
+            batch.noise[:] = np.where(may_join & fitting & ~is_shown, doubtful, batch.noise)
         joining = may_join & (fitting | on_slope)
         grows = joining[active].any(axis=1)
         active, whitened = active[grows], whitened[grows]
@@ -342,10 +341,11 @@ def _grow(batch: _Batch, growth: GrowthConfig, odds: float) -> BoolArray:
 
 def _on_slope(
     batch: _Batch, chosen: BoolArray, fitting: BoolArray, growth: GrowthConfig
-) -> BoolArray:
+) -> tuple[BoolArray, BoolArray]:
     """Candidates to which the ground goes on from the last of those `chosen`, (S, n).
 
-    Behind one that stands on it, or is in a face, it does not, until the next that is chosen.
+    Of the second ones the returns behind or before them show that it rises. Behind one that stands
+    on it, or is in a face, it does not go on, until the next that is chosen.
     """
     own, place = np.arange(len(chosen))[:, None], np.arange(chosen.shape[1])
 
@@ -359,27 +359,31 @@ def _on_slope(
     distance = batch.r - batch.r[own, before]
     walkable = is_walkable(rise, distance, growth.max_slope) & ~batch.in_face & ~batch.above
     is_open = (before >= 0) & (last(~chosen & ~fitting & ~walkable) < before)
-    goes_on = carries_on(rise, distance, batch.onward, batch.slope_before[own, before])
-    result: BoolArray = is_open & walkable & goes_on
-    return result
+    line = batch.slope[own, before], batch.extent[own, before]
+    is_shown = carries_on(rise, distance, batch.onward, slope_before(*line, distance, growth))
+    is_shown &= is_open & walkable
+    return is_shown | (is_open & walkable & (rise <= 0.0)), is_shown
 
 
 @shared
 def carries_on(rise: Values, distance: Values, onward: Values, before: Values) -> Values:
-    """Whether ground that rises so much [m] over a distance [m] goes on so.
+    """Whether the ground is seen to go on as it rises by so much [m] over a distance [m].
 
     `onward` is the slope behind: where it is less, the ground has come to an object. At the end of
-    a segment (NaN) it is `before`, see `slope_before`. Ground that falls needs no more evidence,
-    as obstacles lie only above it.
+    a segment (NaN) it is `before`, see `slope_before`.
     """
     slope = choose(np.isnan(onward), before, onward)
-    return (rise <= 0.0) | (RISES_ON * rise <= slope * distance)
+    return (rise > 0.0) & (RISES_ON * rise <= slope * distance)
 
 
 @shared
-def slope_before(slope: Values, extent: Values, growth: GrowthConfig) -> Values:
-    """Slope of a line up to one of its candidates, after an extent [m]; NaN if that is short."""
-    return choose(extent >= growth.min_rise_extent, slope, np.nan)
+def slope_before(slope: Values, extent: Values, distance: Values, growth: GrowthConfig) -> Values:
+    """Slope of a line as far as it tells that of the ground at a distance before it, or NaN.
+
+    That is not farther than the line reaches back, its `extent` [m].
+    """
+    is_long = (extent >= growth.min_rise_extent) & (extent >= distance)
+    return choose(is_long, slope, np.nan)
 
 
 def _rows(batch: _Batch, segment: IntArray, place: IntArray) -> FloatArray:

@@ -1,7 +1,5 @@
 """Stage 5: length-scales, from the latent process or simpler models."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Frame, IntArray

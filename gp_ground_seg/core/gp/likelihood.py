@@ -3,8 +3,6 @@
 Compiled code has loops in place of all but `log_likelihood`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,9 +1,7 @@
 """Stage 2: the plane of the ground around the sensor, from the lowest points of one scan."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,7 +76,10 @@ N_LEVEL = 64
 RESOLUTION = 4096.0
 """Support by a point at `MIDDLE` exactly on a plane; that of each is a whole number, so that sums
 are exact."""
-N_REFINEMENTS = 13
+N_FIRST, N_REFINEMENTS = 2, 13
+"""Steps of `refined` before planes are scored, and of the best one."""
+GRAIN = 2.0**-14
+"""To this the planes that are scored are rounded: sums differ by less."""
 MIN_CELLS = 12
 """Occupied cells from which a scan has a plane."""
 
@@ -113,7 +114,7 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
     ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
     cell = (candidates.segment[near] * N_SECTORS // n_segments) * N_RINGS + ring
-    order = np.lexsort((z[near], cell))
+    order = np.argsort(cell + z[near] / (4.0 * MAX_Z), kind='stable')
     near, cell = near[order], cell[order]
     k = N_TOGETHER - 1
     low, high = near[:-k], near[k:]
@@ -123,17 +124,10 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     lowest, is_alone = near[first], np.ones(len(first), dtype=np.bool_)
     place = np.searchsorted(cell[first], cell[together])
     lowest[place], is_alone[place] = near[together], False
-    return cells_of(candidates, cell[first], lowest, near[first], is_alone)
-
-
-def cells_of(
-    candidates: Candidates, cell: IntArray, chosen: IntArray, lowest: IntArray, is_alone: BoolArray
-) -> LowestPoints:
-    """Lowest points of cells: the indices of the `chosen` ones, and of the lowest of all."""
-    x, y, z, r = candidates.x[chosen], candidates.y[chosen], candidates.z, candidates.r[chosen]
+    x, y, r = candidates.x[lowest], candidates.y[lowest], r[lowest]
     weight = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
     inverse = 1.0 / tolerance_at(r)
-    return LowestPoints(x, y, z[chosen], r, inverse, weight, cell, z[lowest], is_alone)
+    return LowestPoints(x, y, z[lowest], r, inverse, weight, cell[first], z[near[first]], is_alone)
 
 
 @shared
@@ -171,13 +165,10 @@ class GroundPlane(NamedTuple):
     # share of the sectors with any cell whose nearest is clearly over it, and below the sensor
     overhung: float = 0.0
     n_support: int = 0  # how many cells lie on it
+    # how many lie clearly below it, but alone, over these: none where things stand on a road
+    undercut: float = 0.0
     # as `height`, of the parallel level with the next best score [m]; infinite if there is none
     other_height: float = math.inf
-
-    @property
-    def depth(self) -> float:
-        """Mean number of cells that lie on it, one behind the other, of the sectors with any."""
-        return self.n_support / (self.coverage * N_SECTORS)
 
     def below(self, x: FloatArray | float, y: FloatArray | float, z: FloatArray | float) -> Any:
         """How far below points it is, along z [m]."""
@@ -195,19 +186,16 @@ class GroundPlane(NamedTuple):
         return self.depression >= MIN_DEPRESSION
 
 
-def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
-    """Fit the plane that most of the lowest points lie on and few rays cross; None without one.
+def find_planes(candidates: Candidates, max_slope: float) -> Iterator[GroundPlane]:
+    """Yield planes that many of the lowest points lie on and few rays cross, the best first.
 
     Consensus (Fischler & Bolles, CACM 1981) over planes through a fixed, evenly spread
     choice of three cells and level planes through one, then a redescending M-estimator
     (Beaton & Tukey, Technometrics 1974) from the best of them. `max_slope` is that of the
     steepest plane to look for, as rise per metre.
     """
-    cells = lowest_points(candidates)
-    if len(cells.z) < MIN_CELLS:
-        return None
     loops = Loops(set_hypotheses, best_of, refined)
-    return described(cells, *own_level(cells, max_slope, loops))
+    return planes_of(lowest_points(candidates), max_slope, loops)
 
 
 STEPS = 1.2207440846057596 ** -np.arange(1.0, 4.0)
@@ -221,19 +209,35 @@ class Loops(NamedTuple):
 
     set_hypotheses: Callable[[LowestPoints, float, FloatArray], int]
     best_of: Callable[[FloatArray, LowestPoints, float], tuple[Plane, float, float]]
-    refined: Callable[[LowestPoints, Plane, float], Plane]
+    refined: Callable[[LowestPoints, Plane, float, int], Plane]
 
 
-def own_level(cells: LowestPoints, max_slope: float, loops: Loops) -> tuple[Plane, float]:
+def planes_of(cells: LowestPoints, max_slope: float, loops: Loops) -> Iterator[GroundPlane]:
+    """Yield planes as `find_planes` does; each after the first by the points that are left."""
+    if len(cells.z) < MIN_CELLS:
+        return
+    planes, left = np.empty((N_LEVEL + N_TRIPLES, 3)), cells
+    planes = planes[: loops.set_hypotheses(cells, max_slope, planes)]
+    while True:
+        best = loops.best_of(planes, left, 0.0)
+        found = described(cells, *own_level(cells, best, max_slope, loops))
+        if found is None:
+            return
+        yield found
+        is_on = np.abs(found.below(cells.x, cells.y, cells.z) * cells.inverse) <= 1.0
+        left = left._replace(weight=np.where(is_on, 0.0, left.weight))
+
+
+def own_level(
+    cells: LowestPoints, first: tuple[Plane, float, float], max_slope: float, loops: Loops
+) -> tuple[Plane, float]:
     """Plane of the level that the robot stands on, and height of another level or infinity.
 
-    It is the plane with the best score, or a parallel one that is not refuted and goes on to where
-    the robot stands, as the best one does not. Points that are nearer to a tight other level do
-    not refine it; the crests of waves are not tight.
+    It is the plane with the best score, `first` as `best_of` returns it, or a parallel one that is
+    not refuted and goes on to where the robot stands, as the best one does not. Points that are
+    nearer to a tight other level do not refine it; the crests of waves are not tight.
     """
-    planes = np.empty((N_LEVEL + N_TRIPLES, 3))
-    planes = planes[: loops.set_hypotheses(cells, max_slope, planes)]
-    best, best_score, _ = loops.best_of(planes, cells, 0.0)
+    best, best_score, _ = first
     # Points of the best plane, and those that lie alone, are of no other level.
     d = np.abs(distance(cells.x, cells.y, cells.z, best))
     is_left = (d * cells.inverse > 1.0) & ~cells.is_alone
@@ -241,7 +245,7 @@ def own_level(cells: LowestPoints, max_slope: float, loops: Loops) -> tuple[Plan
     others = other_levels(best, cells, is_left)
     other, score, support = loops.best_of(others, left, OTHER_SHARE * best_score)
     if score == 0.0:
-        return loops.refined(cells, best, max_slope), math.inf
+        return loops.refined(cells, best, max_slope, N_REFINEMENTS), math.inf
     from_other = np.abs(distance(cells.x, cells.y, cells.z, other))
     whole = left.weight[from_other * cells.inverse <= 1.0].sum()
     if support > TIGHT * RESOLUTION * whole:
@@ -249,12 +253,16 @@ def own_level(cells: LowestPoints, max_slope: float, loops: Loops) -> tuple[Plan
         if other_aside < OWN * aside:
             best, other, d, from_other = other, best, from_other, d
         cells = cells._replace(inverse=np.where(d <= from_other, cells.inverse, 0.0))
-    return loops.refined(cells, best, max_slope), other[0]
+    return loops.refined(cells, best, max_slope, N_REFINEMENTS), other[0]
 
 
 @shared
 def set_hypotheses(cells: LowestPoints, max_slope: float, planes: FloatArray) -> int:
-    """Set planes through three of the points, and level ones through one; return their number."""
+    """Set planes through three of the points, and level ones through one; return their number.
+
+    They are refined before they are scored: where little ground is seen, no three points of it
+    may be on its plane.
+    """
     n, n_planes = len(cells.z), 0
     n_level = min(n, N_LEVEL)
     for t in range(n_level + len(SPREAD)):
@@ -264,7 +272,10 @@ def set_hypotheses(cells: LowestPoints, max_slope: float, planes: FloatArray) ->
             i, j, k = SPREAD[t - n_level] * n
             plane = plane_through(cells, int(i), int(j), int(k))
         if is_possible(plane, max_slope):
-            planes[n_planes, 0], planes[n_planes, 1], planes[n_planes, 2] = plane
+            if t >= n_level:
+                plane = refined(cells, plane, max_slope, N_FIRST)
+            for axis in range(3):
+                planes[n_planes, axis] = math.floor(plane[axis] / GRAIN + 0.5) * GRAIN
             n_planes += 1
     return n_planes
 
@@ -422,13 +433,13 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
 
 
 @shared
-def refined(cells: LowestPoints, first: Plane, max_slope: float) -> Plane:
+def refined(cells: LowestPoints, first: Plane, max_slope: float, n_steps: int) -> Plane:
     """Weighted least squares with Tukey's weights of the plane before, again and again.
 
     If it drifts off to a plane that cannot be the ground, it is the first.
     """
     plane = first
-    for _ in range(N_REFINEMENTS):
+    for _ in range(n_steps):
         plane = solve_plane(weighted_moments(cells, plane), plane)
     return plane if is_possible(plane, max_slope) else first
 
@@ -478,6 +489,7 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundP
     height, sector, inverse = plane[0], cells.cell // N_RINGS, cells.inverse
     d, is_first = distance(cells.x, cells.y, cells.z, plane), is_new(sector)
     is_over = (d * inverse > CLEARLY_OFF) & (cells.z < 0.0) & is_first
+    is_below = (d * inverse < -CLEARLY_OFF) & ~cells.is_alone
     # Floor at the foot of a wall lies alone.
     is_off, lowest = np.abs(d * inverse) > 1.0, distance(cells.x, cells.y, cells.lowest_z, plane)
     d, z = np.where(is_off, lowest, d), np.where(is_off, cells.lowest_z, cells.z)
@@ -503,11 +515,13 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundP
         spread=float(drop[many] - drop[few]),
         overhung=np.count_nonzero(is_over) / np.count_nonzero(is_first),
         n_support=n,
+        undercut=np.count_nonzero(is_below) / n,
         other_height=other_height,
     )
 
 
 def is_new(sector: IntArray) -> BoolArray:
     """Which cells are the nearest of a sector: they come sector by sector, from near to far."""
-    result: BoolArray = np.diff(sector, prepend=-1) != 0
+    result = np.ones(len(sector), dtype=np.bool_)
+    np.not_equal(sector[1:], sector[:-1], out=result[1:])
     return result

@@ -1,7 +1,5 @@
 """Stage 2: what a plane of a scan tells: the height, the tilt, or that z is not up."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -9,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Scan, as_index
-from gp_ground_seg.core.pipeline.ground_plane import FARTHEST, GroundPlane, tolerance_at
+from gp_ground_seg.core.pipeline.ground_plane import FARTHEST, N_SECTORS, GroundPlane, tolerance_at
 from gp_ground_seg.core.pipeline.points import angles_of, rotation
 
 MIN_SUPPORT = 0.35
@@ -18,12 +16,14 @@ MIN_CLEARANCE, MIN_SPREAD = 0.05, 0.06
 """Height of the sensor over the plane [m], and spread of the angles of depression of these points
 [rad], for the same: more than one beam."""
 MIN_DEPTH = 2.5
-"""Points on it one behind the other (`GroundPlane.depth`) that do without both: the lowest beam on
-walls, or a scan of one beam, gives one or two, 2.3 in a corridor; ground gives three and more."""
+"""Points on it one behind the other, on average, that do without both: the lowest beam on walls
+gives one or two, 2.3 in a corridor; ground gives three and more."""
 FEW_CELLS = 45
 """Cells on the plane below which its height is doubtful. Whole scans that show the height have
 more; parts of a scan, up to 60 degrees wide, have fewer, or less than `MIN_COVERAGE` of the
 sectors."""
+UNDERCUT = 0.1
+"""`GroundPlane.undercut` below which a whole plane does without: 0.0 in jams, 0.6 on hills."""
 MIN_COVERAGE = 0.25
 """Share of the sectors with ground in them from which a scan determines the tilt."""
 
@@ -104,12 +104,13 @@ class View(NamedTuple):
     @property
     def is_well_supported(self) -> bool:
         """Whether enough of the lowest points lie on it to level a scan by it."""
-        return self.plane.support >= MIN_SUPPORT or self.is_mirror
+        has_none_below = self.is_whole and self.plane.undercut < UNDERCUT
+        return self.plane.support >= MIN_SUPPORT or self.is_mirror or has_none_below
 
     @property
     def may_be_image(self) -> bool:
         """Whether it may be a mirror image, as of the ceiling in a polished floor."""
-        return self.plane.overhung >= OVERHUNG or not self.is_well_supported
+        return self.plane.overhung >= OVERHUNG or self.plane.support < MIN_SUPPORT
 
     @property
     def is_surface(self) -> bool:
@@ -117,7 +118,8 @@ class View(NamedTuple):
         plane = self.plane
         is_wide = plane.support >= MIN_SUPPORT and plane.coverage >= MIN_COVERAGE
         is_spread = plane.height >= MIN_CLEARANCE and plane.spread >= MIN_SPREAD
-        return is_spread or (is_wide and plane.depth >= MIN_DEPTH)
+        depth = plane.n_support / (plane.coverage * N_SECTORS)
+        return is_spread or (is_wide and depth >= MIN_DEPTH)
 
     @property
     def is_whole(self) -> bool:

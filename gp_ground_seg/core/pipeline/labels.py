@@ -1,7 +1,5 @@
 """Stage 6: labels from the height of each point over the surface, and p_ground."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 
@@ -26,6 +24,7 @@ from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, LabelConfig
 from gp_ground_seg.core.pipeline.relief import Relief
 from gp_ground_seg.core.pipeline.roughness import ground_roughness
+from gp_ground_seg.core.pipeline.vertical_faces import is_flat
 
 HIGHEST_GROUND = 0.5
 """Height over the surface from which no return is ground, however rough the ground is [m]; returns
@@ -57,9 +56,9 @@ def label_points(
 
     A point within the paper's tolerance is ground; above it, the roughness of the ground about it
     decides (see `ground_band`); below the surface there is no obstacle, down to `depth_of_ground`
-    for a sensor at a `height` [m]. Of a vertical face
-    only returns near its lowest one are ground; none are where its base is occluded. Then the
-    returns near the surface vote (see `mean_votes`).
+    for a sensor at a `height` [m]. Of a tile with a vertical face only returns in a flat cell, and
+    near its lowest one, are ground; none are where the base is occluded. Then the returns near the
+    surface vote (see `mean_votes`).
     """
     grid, tiles, label = scan.grid, scan.tiles, config.label
     by_roughness, dtype = label.rule == 'roughness', scan.xyz.dtype
@@ -77,12 +76,14 @@ def label_points(
         sums = near_sums(over[near], tile[near], faces.is_face, units)
         roughness = ground_roughness(tiles, sums, units)
     band = ground_band(roughness, highest, label).astype(dtype)
-    top = np.full(len(roughness), np.inf, dtype)
-    at, occluded = np.flatnonzero(faces.is_face), faces.has_occluded_base[faces.is_face]
-    top[at] = top_of_face(roughness[at], tiles.lowest_z[at].astype(np.float64), occluded, label)
+    lowest = np.append(tiles.lowest_z.astype(np.float64), 0.0)
+    top = top_of_face(roughness, lowest, faces.has_occluded_base, label)
+    is_in_flat = is_flat(scan.extent[grid.cell], label.ground_tolerance)
+    is_limited = faces.is_face[tile] & (faces.has_occluded_base[tile] | ~is_in_flat)
+    top = np.where(is_limited, top.astype(dtype)[tile], np.inf).astype(dtype)
     depth = depth_of_ground(height, label)
     with np.errstate(invalid='ignore'):  # points outside may be infinitely high
-        margin: PointArray = margin_of(over, z, band[tile], top[tile], depth)
+        margin: PointArray = margin_of(over, z, band[tile], top, depth)
     if by_roughness:
         heights = z[near].astype(np.float64) - lowest_of(surface)
         voters, means = mean_votes(near, heights, margin, tiles, label.ground_tolerance)
@@ -190,25 +191,10 @@ def mean_votes(
     that is no ground, a return counts the votes (see `vote_of`) of this tile and the eight around
     it, in its layer, the one above and the one below.
 
-    Parameters
-    ----------
-    voters : (V,) int64
-        Points that vote: those near the surface.
-    over_lowest : (V,) float64
-        Their heights over `lowest_of` [m].
-    margin : (N,) array
-        Margins of all points before the vote (see `Labelled`) [m].
-    tiles : Tiles
-        Tiles of all points.
-    tolerance : float
-        Tolerance of ground [m].
+    The points near the surface vote, `voters` (V,); `over_lowest` (V,) are their heights over
+    `lowest_of`, `margin` (N,) the margins of all points before the vote [m].
 
-    Returns
-    -------
-    voters : (W,) int64
-        Those in such a tile.
-    means : (W,) float64
-        Mean of the votes that they count [m].
+    Returns those in such a tile, (W,), and the means of the votes that they count, (W,) [m].
     """
     has_obstacle, counts = np.zeros((2, len(tiles.place)), dtype=np.bool_)
     tile = as_index(tiles.tile[voters])

@@ -3,8 +3,6 @@
 The loops are those of both backends: numba compiles `trace` with all that it calls.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

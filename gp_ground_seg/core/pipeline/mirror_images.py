@@ -8,8 +8,6 @@ above it. Images that are raised again to what they are images of are no ground.
 Where images are the lowest returns of most cells, the plane of the ground is looked for past them.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -17,6 +15,7 @@ import numpy as np
 
 from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray, PointArray, Scan
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane, tolerance_at
+from gp_ground_seg.core.pipeline.ground_view import View
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
 DEEP, DEEPEST = 0.15, 10.0
@@ -66,16 +65,18 @@ class MirrorImages(NamedTuple):
 NO_IMAGES = MirrorImages(np.zeros(0, dtype=np.int64), np.zeros(0))
 
 
-def find_mirror_images(scan: Scan, pose: SensorPose) -> MirrorImages:
+def find_mirror_images(scan: Scan, pose: SensorPose, view: View | None) -> MirrorImages:
     """Find the mirror images of a scan in the level frame: none unless the road is wet.
 
     An image is below the ground before it, as deep as what it is an image of is high, and hardly
     above the line of sight to ground that is seen nearer. Where rays start must be known, or
-    nothing is told.
+    nothing is told. `view` is the plane that the pose was estimated from, if there is one.
     """
     grid, plane_z = scan.grid, -pose.sensor_height
-    is_known = pose.starts_rays and plane_z < 0.0
-    if not is_known or mirror_share(GroundPlane(pose.sensor_height), scan) < MIRRORED:
+    if not pose.starts_rays or plane_z >= 0.0:
+        return NO_IMAGES
+    is_mirror = view is not None and view.is_mirror and pose.height_estimated
+    if not is_mirror and mirror_share(GroundPlane(pose.sensor_height), scan) < MIRRORED:
         return NO_IMAGES
     inside = np.flatnonzero(grid.inside)
     r, z = grid.r[inside].astype(np.float64), scan.xyz[inside, 2].astype(np.float64)
@@ -124,13 +125,17 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     # Boxes with a return, and a margin of one on all sides.
     low = raised.min(axis=0) - 2.0 * COUNTERPART
     shape = ((raised.max(axis=0) - low) / COUNTERPART).astype(np.int64) + 3
-    inside = ((scan.xyz > low) & (scan.xyz < low + COUNTERPART * shape)).all(axis=1)
-    inside &= plane.below(*scan.xyz.T) > DEEP
-    has_return = np.zeros(shape, dtype=np.bool_)
-    has_return[tuple(((scan.xyz[inside] - low) / COUNTERPART).astype(np.int64).T)] = True
-    box = ((raised - low) / COUNTERPART).astype(np.int64)
-    steps = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 1, 3)
-    return float(has_return[tuple((box + steps).T)].any(axis=1).mean())
+    strides = np.array([shape[1] * shape[2], shape[2], 1])
+    inside, index = plane.below(*scan.xyz.T) > DEEP, np.zeros(len(scan.xyz), dtype=np.int64)
+    for column, least, n, stride in zip(scan.xyz.T, low.tolist(), shape, strides, strict=True):
+        box = (column - least) / COUNTERPART
+        inside &= (box > 0.0) & (box < n)
+        index += box.astype(np.int64) * stride
+    has_return = np.zeros(math.prod(shape.tolist()), dtype=np.bool_)
+    has_return[index[inside]] = True
+    around = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 3) @ strides
+    boxes = ((raised - low) / COUNTERPART).astype(np.int64) @ strides
+    return float(has_return[np.add.outer(boxes, around)].any(axis=1).mean())
 
 
 def in_sight(candidates: Candidates) -> Candidates:

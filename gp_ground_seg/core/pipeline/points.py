@@ -1,7 +1,5 @@
 """Points: check of the input, the one layout that the stages work on, and turning by angles."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, TypeVar

@@ -43,7 +43,8 @@ def build_scan(xyz: PointArray, config: Config) -> Scan:
     tiles = build_tiles(xyz, grid, geometry)
     extremes, numbers = reduce_cells(grid, xyz, tiles.tile)
     candidates = ground_candidates(extremes, numbers, grid.edges, config.lines.min_density_extent)
-    return Scan(xyz, grid, tiles, candidates)
+    extent = extremes[:, 2].astype(np.float64) - extremes[:, 0]
+    return Scan(xyz, grid, tiles, candidates, extent)
 
 
 def bin_edges(grid: GridConfig) -> FloatArray:
@@ -209,8 +210,8 @@ def reduce_cells(
 ) -> tuple[PointArray, CellArray]:
     """Lowest and highest point of each cell, and the number of its points.
 
-    Of equally low points the nearest counts, then the one in the tile of the first place, then the
-    one of the least x, then of the least y, so that the order of the points does not matter.
+    Of equally low points the nearest counts, then the one of the least x, then of the least y, so
+    that the order of the points does not matter.
 
     Returns, for points `xyz` (N, 3) [m] and the `tile` (N,) of each:
 
@@ -232,8 +233,8 @@ def reduce_cells(
     lowest = lowest[r_inside[lowest] == lowest_r[cell[lowest]]]
     # What is left is mostly one point of each cell.
     x, y = xyz[:, 0][inside[lowest]], xyz[:, 1][inside[lowest]]
-    # The first one is written last. Tiles are numbered by their places here.
-    order = np.lexsort((y, x, tile[inside[lowest]]))[::-1]
+    # The first one is written last.
+    order = np.lexsort((y, x))[::-1]
     places, lowest = cell[lowest[order]], inside[lowest[order]]
     lowest_x, lowest_y = np.full((2, size), np.inf, dtype=z.dtype)
     lowest_x[places], lowest_y[places] = x[order], y[order]
@@ -251,9 +252,8 @@ def ground_candidates(
 ) -> Candidates:
     """Lowest point and vertical density of each occupied cell (paper, section II).
 
-    The paper cuts a bin into j slices and averages their densities: points over
-    area. The slices are equally high, so whatever j is, that mean is the number
-    of points over the area of the whole bin, width by height.
+    The paper cuts a bin into j slices and averages their densities: points over area. The slices
+    are equally high, so whatever j is, that mean is points over the area of the whole bin.
 
     For `extremes` and `numbers` see `reduce_cells`; `edges`, (n_bins + 1,), are the ranges of the
     bin edges [m]. For `min_extent` see `vertical_density`.

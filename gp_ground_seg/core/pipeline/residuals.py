@@ -25,11 +25,11 @@ The spread of few cells is itself uncertain: errors over it follow Student's dis
 variance of the ground about the corrected surface is that, and that of the mean, ``W / n``.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
 from gp_ground_seg.core.frame import (
@@ -46,6 +46,9 @@ PRIOR_CELLS = 0.05
 """Cells that the first guess of the ground's variance counts as much as."""
 LEAST_STD = 1e-4
 """Standard deviation of the ground that is said at least: cells agree by chance [m]."""
+HIDDEN, ABOUT, PRIOR_DISTANCE = 2.0, 15, 0.3
+"""Steepness of what no beam saw, behind edges and objects, by what beams see; knots and segments
+over which that is averaged; distance of two knots that tell as much as the prior [m]."""
 PLACES = 2.0**15
 """Units that places are rounded to [1/m]: their squared distances are whole numbers below 2^53."""
 UNITS = 2.0**20
@@ -77,8 +80,8 @@ def correct_surface(
     A knot is seen if one of the two cells that touch it has returns. The height at any other is
     estimated twice: by the process, and by the nearest knot that is seen, whose variance grows by
     ``(slope_std distance)^2``, the prior of the slope. The two are weighted by their inverse
-    variances. The result is as uncertain as evidence so far away, or as the process where that is
-    more, plus the variance between the two.
+    variances. The result is as uncertain as that knot, plus the variance between the two, and the
+    rise over the distance by slopes `HIDDEN` times as steep as those about the knot.
 
     `noise_std` is that of the process [m], `slope_std` the prior standard
     deviation of the ground's slope.
@@ -100,19 +103,39 @@ def correct_surface(
     if seen.any() and unseen.any():
         distance, nearest = _nearest(surface.knots, seen, unseen)
         alone, apart = alone[unseen], (slope_std * distance) ** 2
+        slopes = _slope_variance(surface.mean + correction, seen, surface.knots, slope_std)
         for table in (correction, variance, noise):
             table[unseen] = table[seen][nearest]
         near_mean = surface.mean[seen][nearest]
         difference = near_mean - surface.mean[unseen]
         weight = alone / np.maximum(alone + variance[unseen] + apart, np.finfo(float).tiny)
         correction[unseen] += weight * difference
-        variance[unseen] = np.maximum(variance[unseen], alone) + apart
         variance[unseen] += weight * (1.0 - weight) * difference**2
+        variance[unseen] += slopes[seen][nearest] * (HIDDEN * distance) ** 2
         whole[unseen] = variance[unseen] + noise[unseen]
     mean, std = surface.mean + correction, np.maximum(np.sqrt(variance), LEAST_STD)
     # Returns lie on the ground: they depart from the surface no less than it.
     return_rms = np.maximum(np.sqrt(whole), std)
     return CorrectedSurface(surface.knots, correction, mean, std, return_rms)
+
+
+def _slope_variance(
+    height: FloatArray, seen: BoolArray, knots: FloatArray, slope_std: float
+) -> FloatArray:
+    """Mean square slope between knots side by side that are `seen`, about each knot, (M, K).
+
+    Over `ABOUT` knots and segments, weighted by the squares of the distances; so is `slope_std`,
+    the prior, by that of `PRIOR_DISTANCE`.
+    """
+    prior, sums = (PRIOR_DISTANCE / ABOUT) ** 2, np.zeros((2, *seen.shape))
+    for axis in (0, 1):
+        both = seen & np.roll(seen, 1, axis)
+        both[:, 0] = False  # the last knot is not beside the first one
+        for total, table in zip(sums, (height, _places(len(seen), knots)), strict=True):
+            total += np.where(both, np.abs(table - np.roll(table, 1, axis)), 0.0) ** 2
+    rises, steps = (uniform_filter(total, ABOUT, mode=('wrap', 'constant')) for total in sums)
+    result: FloatArray = (rises + prior * slope_std**2) / (steps + prior)
+    return result
 
 
 def _unbiased_variance(
@@ -171,11 +194,15 @@ def _nearest(
     Of segments to either side two are as near as each other. Rounding of sines, which differs from
     processor to processor, must not choose: squared distances of places on a raster are exact.
     """
-    azimuth = 2.0 * np.pi * np.arange(len(seen))[:, None] / len(seen)
-    places = np.stack([knots * np.cos(azimuth), knots * np.sin(azimuth)], axis=-1)
-    raster = np.rint(places * PLACES)
+    places = _places(len(seen), knots)
+    raster = np.rint(np.stack([places.real, places.imag], axis=-1) * PLACES)
     # Not balanced: it is asked once, and takes half the time to build.
     tree = cKDTree(raster[seen], compact_nodes=False, balanced_tree=False)
     _, nearest = tree.query(raster[unseen])
-    distance: FloatArray = np.linalg.norm(places[seen][nearest] - places[unseen], axis=-1)
-    return distance, nearest
+    return np.abs(places[seen][nearest] - places[unseen]), nearest
+
+
+def _places(n_segments: int, knots: FloatArray) -> npt.NDArray[np.complexfloating]:
+    """Places of the knots of every segment, x + iy, (M, K) [m]."""
+    azimuth = 2.0 * np.pi * np.arange(n_segments)[:, None] / n_segments
+    return knots * np.cos(azimuth) + 1j * (knots * np.sin(azimuth))

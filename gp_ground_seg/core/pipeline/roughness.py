@@ -7,8 +7,6 @@ the wide one it is the median, and bounds the other: an object that fills the ne
 fill the wide one. Where few tiles are seen, the median of the frame counts as some more.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Stage 2: height and tilt of the sensor over the ground near it, from one scan (docs/pose.md)."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

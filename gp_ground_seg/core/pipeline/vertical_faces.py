@@ -3,13 +3,12 @@
 A band about the ground cannot separate the base of a wall from the ground before it. The
 returns above the base can: together they form a vertical surface. The base of a face is
 occluded where something stands before it, or where the rings of the sensor miss the strip of
-ground in its tile; the lowest return of the tile then belongs to the face.
+ground in its tile; the lowest return of the tile then belongs to the face. A polar cell that is
+flat shows ground beside the face: near the sensor cells are finer than tiles.
 
 Terrain is smooth: the returns of a tile lie on a plane. Those of a bush or of stairs do not.
 Raised tiles are no ground either where many around them scatter more than the own level does.
 """
-
-from __future__ import annotations
 
 import numpy as np
 
@@ -98,11 +97,11 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     is_rest = above > label.ground_tolerance
     sums = _sums(x, y, above, row + len(tall) * is_rest, 2 * len(tall))
     foot, rest = sums[:, : len(tall)], sums[:, len(tall) :]
-    reaches = np.zeros(len(tall), dtype=np.bool_)
-    reaches[row[above > face_height(label)]] = True
+    reaches = extent > face_height(label)
     result.is_face[tall] = reaches & is_vertical(foot, rest, faces)
     result.is_steep[tall] = reaches & is_steep(rest)
     result.has_occluded_base[tall] = result.is_face[tall] & is_base_occluded(foot, rest, faces)
+    result.has_occluded_base[_with_flat_foot(scan, label.ground_tolerance)] = False
     square = np.where(result.is_face[tall], UNKNOWN, scatter_square(foot, rest))
     rough = tall[_scattered(tiles.place[tall], n_sides, square, extent, over, label)]
     result.is_face[rough] = result.has_occluded_base[rough] = True
@@ -112,6 +111,15 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     is_beyond = is_beyond_edge(gap, candidates.r, candidates.z + height, label)
     beyond = candidates.tile[is_beyond]
     result.has_occluded_base[beyond] = result.is_face[beyond]
+    return result
+
+
+def _with_flat_foot(scan: Scan, tolerance: float) -> CellArray:
+    """Tiles of whose lowest returns some are in a flat cell, with repetitions."""
+    candidates = scan.candidates
+    is_foot = candidates.z - scan.tiles.lowest_z[candidates.tile] <= tolerance
+    cell = candidates.segment * scan.grid.n_bins + candidates.bin
+    result: CellArray = candidates.tile[is_foot & is_flat(scan.extent[cell], tolerance)]
     return result
 
 
@@ -136,6 +144,12 @@ def _scattered(
     about = SCATTER[levels_about(place, level, n_sides, SCATTERED, 0)]
     result: BoolArray = (level != UNKNOWN_LEVEL) & (over > face) & (about > smooth_up_to(own))
     return result
+
+
+@shared
+def is_flat(extent: Values, tolerance: float) -> Values:
+    """Whether a cell shows no vertical face: of several points, none much higher than another."""
+    return (extent > 0.0) & (extent <= tolerance)
 
 
 @shared
@@ -246,11 +260,11 @@ def scatter_square(foot: FloatArray, rest: FloatArray) -> Values:
 def normal_z(xx: Values, yy: Values, zz: Values, xy: Values, xz: Values, yz: Values) -> Values:
     """Vertical part of the unit normal of points with the given scatter, in closed form.
 
-    The adjugate of the scatter matrix is the sum of the outer products of its
-    eigenvectors, each weighted by the product of the other two eigenvalues: the
-    normal of a plane, the direction of least scatter, has nearly all the weight. The
-    share of the vertical in its trace is the squared vertical part of the normal.
-    Of a pole, both horizontal directions count; of a shapeless cluster, all three.
+    The adjugate of the scatter matrix is the sum of the outer products of its eigenvectors, each
+    weighted by the product of the other two eigenvalues: the normal of a plane, the direction of
+    least scatter, has nearly all the weight. The share of the vertical in its trace is the squared
+    vertical part of the normal. Of a pole, both horizontal directions count; of a shapeless
+    cluster, all three.
 
     It is 0 for vertical planes and poles, 1 for level planes, and 1 where there is no scatter, or
     only along a line.
