@@ -51,8 +51,7 @@ ISOLATION = {
 }
 os.environ.update(ISOLATION)
 # Nothing is said twice in a test, however long that takes.
-THROTTLED['throttle_duration_sec'] = 600.0
-diagnostics.LOG_PERIOD = 6000.0
+THROTTLED['throttle_duration_sec'] = diagnostics.LOG_PERIOD = 600.0
 
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -291,12 +291,12 @@ class GroundSegmenter:
     def _past_images(self, scan: Scan, below: View | None) -> View | None:
         """View of a mirror, if candidates that are no images of it show one; else `below`."""
         if below is not None:
-            below = below._replace(is_mirror=mirror_share(below.plane, scan) >= MIRRORED)
+            below = below._replace(is_mirror=_is_mirror(below, scan))
             if not (below.is_mirror or below.may_be_image):
                 return below
         left = scan._replace(candidates=in_sight(scan.candidates))
         for view in self._views(left):
-            if view.is_whole and mirror_share(view.plane, scan) >= MIRRORED:
+            if _is_mirror(view, scan):
                 # Again, without the images that were lowest in their cells.
                 c = left.candidates
                 off = np.abs(view.plane.below(c.x, c.y, c.z))
@@ -336,6 +336,11 @@ class GroundSegmenter:
         for plane in islice(planes, MOST_PLANES):
             if not is_ceiling(plane, scan):
                 yield View(plane, turn)
+
+
+def _is_mirror(view: View, scan: Scan) -> bool:
+    """Whether much of what is below a plane of many points is the image of what is over it."""
+    return view.is_whole and mirror_share(view.plane, scan) >= MIRRORED
 
 
 def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[float, ...]:

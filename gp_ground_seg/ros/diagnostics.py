@@ -90,16 +90,17 @@ class InputTask:
             self._listening_since = now
         while self._arrivals and now - self._arrivals[0] > RATE_WINDOW:
             self._arrivals.popleft()
-        span = self._arrivals[-1] - self._arrivals[0] if self._arrivals else 0.0
+        n_events = len(self._arrivals)
+        span = self._arrivals[-1] - self._arrivals[0] if n_events else 0.0
         # The first event opens the span over which the others are counted.
-        rate = (len(self._arrivals) - 1) / span if span > 0.0 else None
+        rate = (n_events - 1) / span if span > 0.0 else None
         age = None if self._stamp is None else ros_time - self._stamp
         values = {
             'Topic': self._source.topic,
             'Publishers': str(self._source.n_publishers),
             'QoS': self._source.qos_words,
             'Events since startup': str(self._n_arrived),
-            'Events in window': str(len(self._arrivals)),
+            'Events in window': str(n_events),
             'Duration of window (s)': f'{span:.3f}',
             'Actual frequency (Hz)': _digits(rate, '.2f'),
             'Time since last cloud (s)': f'{now - self._last_arrival:.3f}',
@@ -113,19 +114,23 @@ class InputTask:
         return Status('input', *self._judge(now, limits.stale_after), values)
 
     def _judge(self, now: float, stale_after: float) -> tuple[Level, str]:
-        source, n = self._source, self._n_recent
+        source, n_received = self._source, self._n_recent
         silence = now - max(self._last_arrival, self._listening_since)
         if source.idle:
             return Level.OK, f'not listening to {source.topic}: {source.idle}'
         if silence > stale_after:
-            said = f'no cloud on {source.topic} for {silence:.1f} s ({source.senders})'
+            n = source.n_publishers
+            senders = f'publishers: {n}' if n else 'nobody sends clouds'
+            said = f'no cloud on {source.topic} for {silence:.1f} s ({senders})'
             return Level.STALE, f'{said}; {source.fault}' if source.fault else said
         if n_refused := self._n_refused_recent:
-            share = 'every cloud' if n_refused == n else f'{n_refused} of {n} clouds'
+            every = n_refused == n_received
+            share = 'every cloud' if every else f'{n_refused} of {n_received} clouds'
             return Level.ERROR, f'{share} refused: {self._last_error}'
         if source.fault:
             return Level.WARN, source.fault
-        return Level.OK, 'receiving' if n else f'waiting for the first cloud on {source.topic}'
+        waiting = f'waiting for the first cloud on {source.topic}'
+        return Level.OK, 'receiving' if n_received else waiting
 
 
 class ProcessingTask:
@@ -219,7 +224,7 @@ def _faults_of(scan: Segmentation) -> list[str]:
     if faults:
         return faults
     if not scan.fit.n_segments:
-        return ['no ground found in the newest cloud: is z up, and sensor.height right?']
+        return ['no ground found in the newest cloud']
     is_failed = scan.fit.status == 'failed'
     return ['the hyper-parameters could not be learned'] if is_failed else []
 
@@ -252,7 +257,6 @@ class Diagnostics:
         self.input = InputTask(time.monotonic(), source)
         self.processing = ProcessingTask()
         self._newest: Segmentation | None = None  # its statistics are computed for a report only
-        self._last_line = time.monotonic() - 0.9 * LOG_PERIOD  # the first line of the log is early
         self._node, self._config = node, config
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         period = config.diagnostics.period
@@ -270,15 +274,15 @@ class Diagnostics:
         self, scan: Segmentation, arrival: float, stages: Mapping[str, float], age: float | None
     ) -> None:
         """Count the cloud that came at `arrival` [s], as in `processed`; log its stages."""
-        logger = self._node.get_logger()
+        logger, backend = self._node.get_logger(), scan.fit.backend
         times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
         logger.debug(f'times of the stages [ms]: {times}')
         if self._newest is None:
             logger.info(
                 f'first cloud: frame {self.input.frame!r}, {len(scan.label)} points, sensor '
-                f'{scan.pose.sensor_height:.2f} m over the ground, segmented with {scan.backend}'
+                f'{scan.pose.sensor_height:.2f} m over the ground, segmented with {backend}'
             )
-        self.processing.processed(time.monotonic() - arrival, scan.backend, stages, age)
+        self.processing.processed(time.monotonic() - arrival, backend, stages, age)
         self._newest = scan
 
     def summary(self) -> str:
@@ -295,10 +299,13 @@ class Diagnostics:
         ]
         array, node_name = DiagnosticArray(), self._node.get_fully_qualified_name()
         array.header.stamp = now.to_msg()
-        if time.monotonic() > self._last_line + LOG_PERIOD:
-            self._last_line = time.monotonic()
-            said = '; '.join(f'{own.task} {own.level.name}: {own.message}' for own in statuses)
-            self._node.get_logger().info(f'so far: {self.summary()}; {said}')
+        said = '; '.join(f'{own.task} {own.level.name}: {own.message}' for own in statuses)
+        self._node.get_logger().info(
+            f'so far: {self.summary()}; {said}',
+            skip_first=True,
+            throttle_duration_sec=LOG_PERIOD,
+            throttle_time_source_type=STEADY_CLOCK,
+        )
         for status in statuses:
             message = DiagnosticStatus(
                 level=bytes([status.level]),

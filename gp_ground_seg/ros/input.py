@@ -24,6 +24,9 @@ MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
 LARGE_CLOUD = 500_000  # size up to which stock Fast DDS loses no best-effort cloud [bytes]
 JUMP_TOLERANCE = 0.5  # stamps of several sensors on a topic may be so far out of order [s]
+NOTHING_ARRIVES = (
+    'qos_overrides asks for reliable, and a publisher offers best effort: nothing arrives from it'
+)
 AGE_WINDOW = 10  # clouds over which the median of their age is taken
 MAX_AGE = 1.0  # age of a cloud when it is sent from which on its stamp is of another clock [s]
 NO_TIME = (
@@ -94,31 +97,21 @@ class CloudSubscription:
         # The executor still uses a subscription within its own event; a guard condition runs
         # after all that became ready with it.
         self._review_soon = node.create_guard_condition(self.review)
-        # The event can come before the publisher is listed, and there is none for its end.
+        # The event can come before the publisher is listed, and there is no event for the end
+        # of the last best-effort publisher: they are looked at every second too.
         node.create_timer(1.0, self._every_second, clock=STEADY_CLOCK)
 
     @property
     def qos_words(self) -> str:
         """Quality of service in use, as in ``reliable, keep_last 5, volatile``."""
-        profile, history = self._profile, f'{self._profile.history.name} {self._profile.depth}'
-        return f'{self._reliability.name}, {history}, {profile.durability.name}'.lower()
+        history, durability = self._profile.history, self._profile.durability
+        words = f'{self._reliability.name}, {history.name} {self._profile.depth}'
+        return f'{words}, {durability.name}'.lower()
 
     @property
     def n_publishers(self) -> int:
         """Number of publishers of clouds, when last counted."""
         return len(self._offered)
-
-    @property
-    def senders(self) -> str:
-        """How many publishers of clouds there are; where else clouds are sent, if none."""
-        if n := self.n_publishers:
-            return f'publishers: {n}'
-        node = self._node
-        own = node.get_publisher_names_and_types_by_node(node.get_name(), node.get_namespace())
-        every = node.get_topic_names_and_types()
-        clouds = [name for name, types in every if CLOUD_TYPE in types and name not in dict(own)]
-        others = ', '.join(filter(node.count_publishers, clouds))
-        return 'nobody sends clouds' + (others and f', but on {others}: remap points to one')
 
     @property
     def fault(self) -> str:
@@ -141,10 +134,7 @@ class CloudSubscription:
             )
         is_refused = best_effort in self._offered.values()
         if is_refused and self._profile.reliability == ReliabilityPolicy.RELIABLE:
-            yield (
-                'qos_overrides asks for reliable, and a publisher offers best effort: nothing '
-                'arrives from it; set best_effort, or no reliability'
-            )
+            yield NOTHING_ARRIVES
         if clock.ros_time_is_active and not clock.now().nanoseconds:
             yield NO_TIME
         age = median(self._ages) if self._ages else 0.0
@@ -219,7 +209,7 @@ class CloudSubscription:
             if (kind := fault.split()[0]) not in self._logged:
                 self._logged.add(kind)
                 self._node.get_logger().warning(f'on {self.topic}, {fault}')
-        self.review()
+        self._review_soon.trigger()
 
     def review(self) -> None:
         """Subscribe as the publishers offer, or not at all, as clouds are wanted now; log it."""

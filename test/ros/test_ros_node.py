@@ -78,7 +78,7 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(tmp_path):
     points = street(3000)
     with ros.stderr_in(tmp_path) as said, bench({'diagnostics.stale_after': 1.0}) as b:
         stale = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.STALE)
-        assert f'{NAMESPACE}/points for' in stale.message and '(publishers: 1)' in stale.message
+        assert f'{NAMESPACE}/points' in stale.message
         assert not b.set('diagnostics.stale_after', 600.0)
         # 0.4 s back is no jump: several sensors may send.
         for second, nanosec in ((0, 0), (1, 4 * 10**8), (1, 0), (2, 0), (0, 0), (1, 0), (0, 0)):

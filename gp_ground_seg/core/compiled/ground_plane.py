@@ -38,11 +38,7 @@ def find_planes(candidates: Candidates, max_slope: float) -> Iterator[GroundPlan
     return planes_of(lowest_points(candidates), max_slope, _LOOPS)
 
 
-_LOOPS = Loops(
-    jit(entry=True)(set_hypotheses),
-    jit(entry=True)(best_of),
-    jit(entry=True)(refined),
-)
+_LOOPS = Loops(jit(entry=True)(set_hypotheses), jit(entry=True)(best_of), jit(entry=True)(refined))
 
 
 @compiled_form(ground_plane.supports_of)

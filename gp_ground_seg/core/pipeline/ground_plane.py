@@ -130,7 +130,6 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     return LowestPoints(x, y, z[lowest], r, inverse, weight, cell[first], z[near[first]], is_alone)
 
 
-@shared
 def tolerance_at(r: Values) -> Values:
     """Distance to the plane that a point at range `r` still supports [m]."""
     return TOLERANCE + TOLERANCE_GROWTH * r
