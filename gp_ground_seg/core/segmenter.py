@@ -339,8 +339,9 @@ class GroundSegmenter:
 
 
 def _is_mirror(view: View, scan: Scan) -> bool:
-    """Whether much of what is below a plane of many points is the image of what is over it."""
-    return view.is_whole and mirror_share(view.plane, scan) >= MIRRORED
+    """Whether much of what is below a plane is the image of what is over it."""
+    # In a frame that is steep to the plane, the lowest points are not those of the ground.
+    return view.is_whole and not view.is_steep and mirror_share(view.plane, scan) >= MIRRORED
 
 
 def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[float, ...]:
