@@ -285,11 +285,11 @@ class Segmentation:
 
         About `ground_z`: surface, roughness and range noise together. NaN without a model. A few
         large errors make their root mean square too wide: it is scaled until as many returns
-        called ground are within it as in a normal distribution.
+        called ground are within it as in a normal distribution, to a hundredth.
         """
         rms, own = self._at_points(self.corrected.return_rms), self.is_ground
         errors = np.abs(self.height[own]) / rms[own]
-        scale = np.quantile(errors, WITHIN_STD) if len(errors) else 1.0
+        scale = np.round(np.quantile(errors, WITHIN_STD), 2) if len(errors) else 1.0
         return np.maximum(scale * rms, self.ground_std)
 
     def _at_points(self, table: FloatArray) -> FloatArray:
