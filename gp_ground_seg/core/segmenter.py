@@ -292,7 +292,7 @@ class GroundSegmenter:
         """View of a mirror, if candidates that are no images of it show one; else `below`."""
         if below is not None:
             below = below._replace(is_mirror=_is_mirror(below, scan))
-            if not (below.is_mirror or below.may_be_image):
+            if below.is_dry:
                 return below
         left = scan._replace(candidates=in_sight(scan.candidates))
         for view in self._views(left):

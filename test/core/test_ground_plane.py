@@ -36,6 +36,7 @@ def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
     found = (list(islice(backend.find_planes(candidates, 0.577), 3)) for backend in BACKENDS)
     for a, b in zip(*found, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
+        assert 0.0 < a.support <= 1.0 and a.n_support <= ground_plane.N_CELLS
 
 
 def test_floor_at_the_foot_of_a_wall_lies_on_the_plane_of_the_floor():
@@ -71,6 +72,7 @@ def test_backends_agree_on_the_score_of_a_plane(seed, share):
         return
     k = planes.tolist().index(list(best))
     np.testing.assert_allclose((score, support), (scores.max(), supports[k]), rtol=1e-12)
+    assert scores[k] == pytest.approx(scores.max(), rel=1e-12)
     assert ground_plane.best_of(planes, cells, score)[1] == 0.0
 
 

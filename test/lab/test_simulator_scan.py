@@ -1,7 +1,5 @@
 """Scans: sensors and mounts, labels against geometry, noise, occlusion, reflections, scenes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Where rays meet terrain and solids: dense sampling, obvious twins, by hand."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -31,7 +31,7 @@ from gp_ground_seg.core.gp.kernels import (
 )
 from gp_ground_seg.core.gp.model import Model, SegmentSurfaces
 from gp_ground_seg.core.jit import compiled_form, jit
-from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
+from gp_ground_seg.core.parameters.config import ObservationConfig
 from gp_ground_seg.core.pipeline.lines import is_walkable
 
 
@@ -96,7 +96,6 @@ def grow_inliers(
     frame: Frame,
     theta: FloatArray,
     model: Model,
-    odds: float,
     from_neighbours: Evidence,
     step: int,
     found: SegmentSurfaces,
@@ -104,10 +103,10 @@ def grow_inliers(
     """Do what the twin does; the inliers of other segments are arbitrary."""
     columns = _make_columns(frame, step, 0, np.float32)
     prior = _prior_of(frame, theta, model.observation)
-    reach = math.exp(theta[3]) if odds > 0.0 else 0.0
+    reach = math.exp(theta[3]) if model.by_roughness else 0.0
     for m in range(0, len(frame.candidates.offsets) - 1, step):
         n_new = _begin(frame, m, prior.noise, reach, from_neighbours, found, columns)
-        _grow(frame, m, n_new, prior, model.growth, odds, found, columns)
+        _grow(frame, m, n_new, prior, model, found, columns)
         first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
         for c in range(first, stop):
             certain = noise_among(found.alike[c], prior.noise)
@@ -216,8 +215,7 @@ def _grow(
     m: int,
     n_new: int,
     prior: _Prior,
-    growth: GrowthConfig,
-    odds: float,
+    model: Model,
     found: SegmentSurfaces,
     columns: _Columns,
 ) -> None:
@@ -230,10 +228,10 @@ def _grow(
     size = _lay_out(stop - first, prior, columns)
     for a in range(n_new):
         i = columns.new[a]
-        if odds > 0.0 and frame.in_face[first + i]:
+        if model.by_roughness and frame.in_face[first + i]:
             height, variance = _predict(i, columns)
             columns.noise[i] = noise_in_doubt(
-                columns.z[i], height, variance, columns.noise[i], True, odds
+                columns.z[i], height, variance, columns.noise[i], True
             )
     n_inliers = done = 0
     while n_new > 0 or n_inliers == 0:
@@ -246,7 +244,7 @@ def _grow(
             _observe(i, n_inliers, min(i, done) & -LANES, size, prior, columns)
             n_inliers += 1
         n_new = _find_joining(
-            frame, first, inlier, done, n_inliers > 0, prior.noise, growth, odds, columns
+            frame, first, inlier, done, n_inliers > 0, prior.noise, model, columns
         )
         if n_new == 0:
             break
@@ -260,14 +258,14 @@ def _find_joining(
     done: int,
     has_inliers: bool,
     noise: float,
-    growth: GrowthConfig,
-    odds: float,
+    model: Model,
     columns: _Columns,
 ) -> int:
     """Set the new ones to those from `done` on that now join; return their number."""
     r, z, lines, n_new, last = frame.candidates.r, columns.z, frame.lines, 0, done - 1
+    growth = model.growth
     for i in range(done, len(inlier)):
-        c = first + i
+        c, in_face = first + i, frame.in_face[first + i]
         if inlier[i]:
             last = i
             continue
@@ -279,17 +277,15 @@ def _find_joining(
         if last >= 0:
             rise, distance = z[i] - z[last], r[c] - r[first + last]
             walkable = is_walkable(rise, distance, growth.max_slope)
-            if walkable and not frame.in_face[c] and not columns.above[i]:
+            if walkable and not in_face and not columns.above[i]:
                 line = lines.line[first + last]
                 extent = r[first + last] - r[lines.start[line]]
                 before = slope_before(lines.slope[line], extent, distance, growth)
                 is_shown, falls = carries_on(rise, distance, frame.onward[c], before), rise <= 0.0
             elif not joins:
                 last = -1  # it stands on the ground, which does not go on behind it
-        if joins and odds > 0.0 and not is_shown:
-            columns.noise[i] = noise_in_doubt(
-                z[i], height, variance, columns.noise[i], frame.in_face[c], odds
-            )
+        if joins and model.by_roughness and not is_shown:
+            columns.noise[i] = noise_in_doubt(z[i], height, variance, columns.noise[i], in_face)
         joins |= is_shown or falls
         if joins:
             columns.new[n_new] = i

@@ -26,8 +26,6 @@ LEAST_STD = 1e-3
 """Standard deviation of a surface below which it counts as that [m]."""
 LEAST_PRECISION = 1e-3
 """Precision below which a surface shows nothing [1/m^2]: rounding is left of the prior."""
-ODDS = 0.25
-"""Odds that a candidate is an obstacle."""
 
 
 class Evidence(NamedTuple):

@@ -16,7 +16,6 @@ from gp_ground_seg.core.frame import (
     Values,
 )
 from gp_ground_seg.core.gp.evidence import (
-    ODDS,
     STEP,
     Evidence,
     at_candidates,
@@ -99,18 +98,17 @@ def fit_surfaces(
     latter alone does not start the set (see `gp_ground_seg.core.gp.evidence`). The surface, too,
     is that of the segment and of those beside it together.
     """
-    knots, mean, std = frame.knots, found.mean, found.std
+    knots, observation, mean, std = frame.knots, model.observation, found.mean, found.std
     u, knot_u = found.log_length_scale, found.knot_log_length_scale
-    observation, odds = model.observation, ODDS if model.by_roughness else 0.0
     if model.is_latent:
         latent_log_length_scales(frame, given, 1, u, knot_u)
     from_neighbours = Evidence(np.empty((0, 0)), np.empty((0, 0)))
     if model.uses_neighbours:
         find_seeds(frame, given, observation.slope_std, found.seed)
-        grow_inliers(frame, given, model, odds, from_neighbours, STEP, found)
+        grow_inliers(frame, given, model, from_neighbours, STEP, found)
         regress(frame, given, observation, STEP, found)
         from_neighbours = evidence_of_neighbours(mean, std, knots, given, observation)
-    grow_inliers(frame, given, model, odds, from_neighbours, 1, found)
+    grow_inliers(frame, given, model, from_neighbours, 1, found)
     if model.is_latent and (theta[2:] != given[2:]).any():
         latent_log_length_scales(frame, theta, 1, u, knot_u)
     regress(frame, theta, observation, 1, found)
@@ -122,8 +120,8 @@ def fit_surfaces(
 
 OBSTACLE_DEPTH = 1.0
 """Height over which the lowest returns of obstacles are spread [m]."""
-ODDS_IN_FACE = 4.0
-"""Odds that a candidate in a vertical face is an obstacle."""
+ODDS, ODDS_IN_FACE = 0.25, 4.0
+"""Odds that a candidate is an obstacle, and that one in a vertical face is."""
 MOST_DOUBT = 30.0
 """Logarithm of odds that are as good as infinite."""
 ROUNDING, ROUNDING_SINGLE = 1e-12, 1e-6
@@ -210,18 +208,18 @@ def posterior_covariance(
 
 @shared
 def noise_in_doubt(
-    z: Values, height: Values, variance: Values, noise: Values, in_face: Values, odds: Values
+    z: Values, height: Values, variance: Values, noise: Values, in_face: Values
 ) -> Values:
     """Variance of the noise of a candidate that joins, which may be an obstacle [m^2].
 
     As for the labels, ground and obstacle are compared: the heights of the one are distributed by
-    the prediction, those of the other evenly over `OBSTACLE_DEPTH`; `odds` are the obstacles for
-    each ground. With this noise the variance of the prediction shrinks by the probability of
-    ground times what certain ground would take from it: a candidate in doubt shows little
-    (probabilistic data association). Obstacles stand above the ground, so there is no doubt below.
+    the prediction, those of the other evenly over `OBSTACLE_DEPTH`, at the odds above. With this
+    noise the variance of the prediction shrinks by the probability of ground times what certain
+    ground would take from it: a candidate in doubt shows little (probabilistic data association).
+    Obstacles stand above the ground, so there is no doubt below.
     """
     residual, spread = z - height, variance + noise
-    odds = choose(in_face, ODDS_IN_FACE, odds)
+    odds = choose(in_face, ODDS_IN_FACE, ODDS)
     density = np.sqrt(2.0 * np.pi * spread) / OBSTACLE_DEPTH
     doubt = odds * density * np.exp(np.minimum(0.5 * residual * residual / spread, MOST_DOUBT))
     return noise + choose(residual > 0.0, doubt * spread, 0.0)
@@ -231,7 +229,6 @@ def grow_inliers(
     frame: Frame,
     theta: FloatArray,
     model: Model,
-    odds: float,
     from_neighbours: Evidence,
     step: int,
     found: SegmentSurfaces,
@@ -244,13 +241,13 @@ def grow_inliers(
     before (see `carries_on`). This repeats until none joins (GP-INSAC of Chen et al. 2014; the
     paper's outlier rejection).
 
-    `from_neighbours` is the evidence of the segments beside each. Unless `odds` are 0, a candidate
-    among others, or that joins in doubt, shows less: see `noise_among` and `noise_in_doubt`. Where
-    the ground carries on to it there is no doubt.
+    `from_neighbours` is the evidence of the segments beside each. If ``label.rule`` is roughness,
+    a candidate among others, or that joins in doubt, shows less: see `noise_among` and
+    `noise_in_doubt`. Where the ground carries on to it there is no doubt.
     """
     candidates, z = frame.candidates, frame.candidates.z - frame.prior_mean
     sill, gate_noise = variances_of(frame, theta, model.observation, ROUNDING_SINGLE)
-    found.alike[:] = _count_near(candidates, np.exp(theta[3]) if odds > 0.0 else 0.0)
+    found.alike[:] = _count_near(candidates, np.exp(theta[3]) if model.by_roughness else 0.0)
     noise, beside = noise_among(found.alike, gate_noise), at_candidates(from_neighbours, frame)
     above = contradicts(*beside, z, gate_noise)
     lines = frame.lines
@@ -276,7 +273,7 @@ def grow_inliers(
             above[place],
             Evidence(layout.take(beside.height), layout.take(beside.precision)),
         )
-        chosen = _grow(state, model.growth, odds)
+        chosen = _grow(state, model)
         found.inlier[place[mask]] = chosen[mask]
         found.doubt[place[mask]] = state.noise[mask] - noise[place[mask]]
 
@@ -303,12 +300,12 @@ class _Batch(NamedTuple):
 
 
 @np.errstate(over='ignore', invalid='ignore')  # the square of 1e200 m: no fit; -inf times 0
-def _grow(batch: _Batch, growth: GrowthConfig, odds: float) -> BoolArray:
+def _grow(batch: _Batch, model: Model) -> BoolArray:
     """Inliers of each segment, (S, n).
 
-    The noise of the inliers is set, see `noise_in_doubt`, unless `odds` are 0. Candidates that
-    join in a round are conditioned on at once: their rows of ``L^-1 K(inliers, candidates)`` are
-    appended to those of the rounds before, and nothing is factored twice.
+    If ``label.rule`` is roughness, doubt changes their noise (see `noise_in_doubt`). Candidates
+    that join in a round are conditioned on at once: their rows of ``L^-1 K(inliers, candidates)``
+    are appended to those of the rounds before, and nothing is factored twice.
     """
     chosen = np.zeros_like(batch.seed)
     variance = prior_variance(batch.sill, batch.observation, batch.r)
@@ -316,22 +313,22 @@ def _grow(batch: _Batch, growth: GrowthConfig, odds: float) -> BoolArray:
     # Segments that still grow, and the whitened rows of their inliers.
     active, joining = np.arange(len(chosen)), batch.seed
     whitened = np.empty((len(chosen), 0, variance.shape[1]), variance.dtype)
-    if odds > 0.0:
+    if model.by_roughness:
         predicted = combined(0.0, variance, *batch.from_neighbours)
-        doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, True, odds)
+        doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, True)
         batch.noise[:] = np.where(joining & batch.in_face, doubtful, batch.noise)
     while len(active):
         chosen |= joining
         if joining.any():
             whitened = _condition(batch, active, joining[active], whitened, height, variance)
         predicted = combined(height, variance, *batch.from_neighbours)
-        fitting = fits(batch.z, *predicted, batch.gate_noise, growth)
+        fitting = fits(batch.z, *predicted, batch.gate_noise, model.growth)
         # Before anything has joined, only the evidence of neighbours decides.
         may_join = ~chosen & batch.mask
         may_join &= chosen.any(axis=1, keepdims=True) | (batch.from_neighbours.precision > 0.0)
-        on_slope, is_shown = _on_slope(batch, chosen, fitting, growth)
-        if odds > 0.0:
-            doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, batch.in_face, odds)
+        on_slope, is_shown = _on_slope(batch, chosen, fitting, model.growth)
+        if model.by_roughness:
+            doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, batch.in_face)
             batch.noise[:] = np.where(may_join & fitting & ~is_shown, doubtful, batch.noise)
         joining = may_join & (fitting | on_slope)
         grows = joining[active].any(axis=1)

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, Inliers, Values
-from gp_ground_seg.core.gp.evidence import ODDS, Evidence
+from gp_ground_seg.core.gp.evidence import Evidence
 from gp_ground_seg.core.gp.ground import grow_inliers
 from gp_ground_seg.core.gp.kernels import single_threaded_blas
 from gp_ground_seg.core.gp.latent import given_theta, latent_log_length_scales
@@ -147,7 +147,7 @@ def fit_theta(
     if model.is_latent:
         latent_log_length_scales(frame, theta, step, u, knot_u)
     nothing = Evidence(np.empty((0, 0)), np.empty((0, 0)))
-    grow_inliers(frame, theta, model, ODDS if model.by_roughness else 0.0, nothing, step, found)
+    grow_inliers(frame, theta, model, nothing, step, found)
     inliers = take_inliers(frame, step, bool(space.free[2:].any()), found)
     budget = learning.max_evaluations
     return maximise(space, inliers, model.observation, model.is_map, budget, theta, outcome)

@@ -79,7 +79,8 @@ are exact."""
 N_FIRST, N_REFINEMENTS = 2, 13
 """Steps of `refined` before planes are scored, and of the best one."""
 GRAIN = 2.0**-14
-"""To this the planes that are scored are rounded: sums differ by less."""
+"""Planes are rounded to this before they are scored: the backends differ by less, and so score the
+same ones."""
 MIN_CELLS = 12
 """Occupied cells from which a scan has a plane."""
 
@@ -114,6 +115,7 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
     ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
     cell = (candidates.segment[near] * N_SECTORS // n_segments) * N_RINGS + ring
+    # By cell, then by height, as one number: heights add less than half of one.
     order = np.argsort(cell + z[near] / (4.0 * MAX_Z), kind='stable')
     near, cell = near[order], cell[order]
     k = N_TOGETHER - 1
@@ -164,7 +166,7 @@ class GroundPlane(NamedTuple):
     # share of the sectors with any cell whose nearest is clearly over it, and below the sensor
     overhung: float = 0.0
     n_support: int = 0  # how many cells lie on it
-    # how many lie clearly below it, but alone, over these: none where things stand on a road
+    # cells clearly below it, but those that lie alone, for each cell on it: 0 on a road in a jam
     undercut: float = 0.0
     # as `height`, of the parallel level with the next best score [m]; infinite if there is none
     other_height: float = math.inf
@@ -521,6 +523,5 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundP
 
 def is_new(sector: IntArray) -> BoolArray:
     """Which cells are the nearest of a sector: they come sector by sector, from near to far."""
-    result = np.ones(len(sector), dtype=np.bool_)
-    np.not_equal(sector[1:], sector[:-1], out=result[1:])
+    result: BoolArray = np.diff(sector, prepend=-1) != 0
     return result

@@ -23,7 +23,8 @@ FEW_CELLS = 45
 more; parts of a scan, up to 60 degrees wide, have fewer, or less than `MIN_COVERAGE` of the
 sectors."""
 UNDERCUT = 0.1
-"""`GroundPlane.undercut` below which a whole plane does without: 0.0 in jams, 0.6 on hills."""
+"""`GroundPlane.undercut` below which a plane of `FEW_CELLS` needs no `MIN_SUPPORT`: in jams it is
+0, on hills 0.6 and more."""
 MIN_COVERAGE = 0.25
 """Share of the sectors with ground in them from which a scan determines the tilt."""
 
@@ -83,7 +84,7 @@ class View(NamedTuple):
 
     plane: GroundPlane
     turn: FloatArray  # (3, 3) rotation to that frame from the one levelled by the parameters
-    is_mirror: bool = False  # whether what is below it are mirror images
+    is_mirror: bool | None = None  # whether what is below it are mirror images; None: not asked
 
     @property
     def up(self) -> FloatArray:
@@ -105,12 +106,17 @@ class View(NamedTuple):
     def is_well_supported(self) -> bool:
         """Whether enough of the lowest points lie on it to level a scan by it."""
         has_none_below = self.is_whole and self.plane.undercut < UNDERCUT
-        return self.plane.support >= MIN_SUPPORT or self.is_mirror or has_none_below
+        return self.plane.support >= MIN_SUPPORT or has_none_below or bool(self.is_mirror)
 
     @property
     def may_be_image(self) -> bool:
         """Whether it may be a mirror image, as of the ceiling in a polished floor."""
         return self.plane.overhung >= OVERHUNG or self.plane.support < MIN_SUPPORT
+
+    @property
+    def is_dry(self) -> bool:
+        """Whether it is known to have no mirror images."""
+        return self.is_mirror is False and not self.may_be_image
 
     @property
     def is_surface(self) -> bool:

@@ -73,7 +73,7 @@ def find_mirror_images(scan: Scan, pose: SensorPose, view: View | None) -> Mirro
     nothing is told. `view` is the plane that the pose was estimated from, if there is one.
     """
     grid, plane_z = scan.grid, -pose.sensor_height
-    if not pose.starts_rays or plane_z >= 0.0:
+    if not pose.starts_rays or plane_z >= 0.0 or (view is not None and view.is_dry):
         return NO_IMAGES
     is_mirror = view is not None and view.is_mirror and pose.height_estimated
     if not is_mirror and mirror_share(GroundPlane(pose.sensor_height), scan) < MIRRORED:
