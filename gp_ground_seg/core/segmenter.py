@@ -25,7 +25,6 @@ from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_
 from gp_ground_seg.core.gp.learning import Learned
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.parameters.schema import NO_BOX
-from gp_ground_seg.core.pipeline.ground_plane import tolerance_at
 from gp_ground_seg.core.pipeline.ground_view import (
     LOWER_ENDS,
     MAX_TILT,
@@ -37,6 +36,7 @@ from gp_ground_seg.core.pipeline.ground_view import (
     is_doubtful,
     objection_to_ground,
 )
+from gp_ground_seg.core.pipeline.lowest_points import tolerance_at
 from gp_ground_seg.core.pipeline.mirror_images import (
     MIRRORED,
     MirrorImages,

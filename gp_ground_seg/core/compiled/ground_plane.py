@@ -10,26 +10,28 @@ from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import (
     CLEARLY_OFF,
     LEAST_REACH,
-    N_CELLS,
-    N_RINGS,
-    N_SECTORS,
-    RING_EDGES,
     GroundPlane,
     Loops,
-    LowestPoints,
     Moments,
     Plane,
     best_of,
     crossing_of,
     distance,
     levelness,
-    lowest_points,
     planes_of,
     refined,
     refutation_by,
     set_hypotheses,
     support_by,
     tukey_weight,
+)
+from gp_ground_seg.core.pipeline.lowest_points import (
+    N_CELLS,
+    N_RINGS,
+    N_SECTORS,
+    RING_EDGES,
+    LowestPoints,
+    lowest_points,
 )
 
 

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Scan, as_index
-from gp_ground_seg.core.pipeline.ground_plane import FARTHEST, N_SECTORS, GroundPlane, tolerance_at
+from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
+from gp_ground_seg.core.pipeline.lowest_points import FARTHEST, N_SECTORS, tolerance_at
 from gp_ground_seg.core.pipeline.points import angles_of, rotation
 
 MIN_SUPPORT = 0.35

@@ -14,8 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray, PointArray, Scan
-from gp_ground_seg.core.pipeline.ground_plane import GroundPlane, tolerance_at
+from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.ground_view import View
+from gp_ground_seg.core.pipeline.lowest_points import tolerance_at
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
 DEEP, DEEPEST = 0.15, 10.0
