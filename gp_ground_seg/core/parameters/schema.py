@@ -222,10 +222,6 @@ class ParameterGroups:
         group_name, field_name = self.find_spec(name).name.split('.')
         return getattr(getattr(self, group_name), field_name)
 
-    def flat(self) -> dict[str, ParameterValue]:
-        """Every value by its dotted name, in order of declaration."""
-        return {name: self[name] for name in self.specs()}
-
     def nested(self) -> dict[str, dict[str, ParameterValue]]:
         """Every value as ``{group: {field: value}}``."""
         return dataclasses.asdict(self)
