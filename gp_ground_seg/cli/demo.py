@@ -16,7 +16,7 @@ from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.point_cloud2 import CloudMessage, read_fields, read_xyz
 from gp_ground_seg.lab.plotting import new_figure, plot_scan_view
 from gp_ground_seg.lab.scoring.metrics import Labels, count_labels, label_ratios, true_labels
-from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_scan
+from gp_ground_seg.lab.simulation import HDL_64E, SCENES, SEMANTIC_KITTI, simulate_scan
 from gp_ground_seg.ros.node_process import GROUND, OBSTACLES, Link, NodeProcess, private_session
 from gp_ground_seg.ros.session import Session, needing_ros
 
@@ -140,7 +140,7 @@ def _write(n_frames: int, path: Path, session: Session) -> None:
         for k in options.progress('scans')(range(n_frames)):
             scan = simulate_scan(scene, HDL_64E, rng, x=SPEED * k * PERIOD)
             stamp = EPOCH * 10**9 + round(k * PERIOD * 1e9)
-            label = semantic_kitti_labels(scan.kind).astype(np.uint32)
+            label = SEMANTIC_KITTI[scan.kind]
             cloud = bags.cloud_from_points(scan.points, stamp, FRAME_ID, label=label)
             write(TOPIC, stamp, bags.encode_cloud(cloud))
             session.check()
