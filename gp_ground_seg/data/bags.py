@@ -279,10 +279,9 @@ def new_bag(
     what appends a message: its topic, the time when it was recorded [ns], and CDR bytes. Raises
     DataError if the path is taken or cannot be written, MissingDependencyError without rosbags.
     """
-    require('rosbags.highlevel', 'rosbags')
+    path, types = Path(path), jazzy_types()
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    path, types = Path(path), jazzy_types()
     if path.suffix == '.bag':
         raise DataError(f'{path}: only ROS 2 bags are written; use .mcap, .db3 or a folder')
     storage = STORAGE_OF_SUFFIX.get(path.suffix, storage)
