@@ -64,7 +64,7 @@ def add_parser(subparsers: options.Subparsers) -> None:
     of_both: tuple[options.Option, ...] = (
         ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
         ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'}),
-        ('--frame', 'which of several, from 0 (default: 0)', {'metavar': 'N', 'type': int}),
+        ('--frame', 'which of several, from 0 (default: 0)', options.whole(0)),
         ('-o --output', f'{ENDINGS} file', {'metavar': 'OUT', 'required': True}),
         *options.CLOUDS, options.FORCE, *options.CONFIG,
     )  # fmt: skip
@@ -89,7 +89,7 @@ def add_parser(subparsers: options.Subparsers) -> None:
         ('input', 'scan, folder of scans, sequence or bag', {'metavar': 'INPUT'}),
         ('--labels', 'SemanticKITTI labels of a scan (default: those next to it)', file),
         ('--frame', 'number of the first frame to show, from 0',
-         {'metavar': 'N', 'type': int, 'default': 0}),
+         {**options.whole(0), 'default': 0}),
         ('--port', 'of the page, or the next free one (default: %(default)s)',
          {**options.NUMBER, 'default': 9090}),
         ('--parameters', 'those to show (default: the basic ones)',

@@ -83,6 +83,7 @@ MISTAKES = {
     'plot scan scan.npy': 'the following arguments are required: -o/--output; see gp-ground-seg p',
     'plot scan scan.npy -o a.gif': 'a.gif: must end in .png or .pdf or .svg',
     'plot scan scan.npy -o old.png': 'old.png: exists already; --force replaces it',
+    'plot scan many -o a.png --frame x': "--frame: 'x': must be a whole number, at least 0",
     'plot scan many -o a.png --frame 2': '--frame 2: must be 0 to 1 here',
     'plot scan drive.mcap -o a.png --frame 3': '--frame 3: must be 0 to 2 here',
     'plot scan scan.npy -o a.png --labels a.label': 'a.label: 0 bytes, expected 7200 for 1800 poi',
