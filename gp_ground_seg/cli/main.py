@@ -29,7 +29,7 @@ COMMANDS = {
     'kitti-to-bag': ('bags', 'write a KITTI sequence as a rosbag2'),
     'segment': ('segment', 'label scans, or split the clouds of a bag'),
     'plot': ('plot', 'draw a scan in perspective, or a segment of it from the side'),
-    'tune': ('plot', 'set parameters by sliders, and see the labels change'),
+    'tune': ('tune', 'set parameters by sliders, and see the labels change'),
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
     'experiment': ('evaluate', 'repeat an experiment of docs/, such as ablation'),
 }

@@ -1,19 +1,15 @@
-"""Look at the labels of a scan: ``plot`` draws pictures, ``tune`` shows them next to sliders."""
+"""``plot``: pictures of a segmented scan: in perspective, or segments of it from the side."""
 
 import argparse
-import shlex
 from pathlib import Path
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import LOGGER, DataError, shown
-from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.files import check_writable, write_file
+from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.semantic_kitti import read_entries
 from gp_ground_seg.lab import plotting
 from gp_ground_seg.lab.scoring.metrics import true_labels
-from gp_ground_seg.lab.tuner import Tuner, open_server, tunable
 
 SCAN = """\
 Draw a scan in perspective: ground grey, obstacles orange; with --labels missed ground blue and
@@ -34,25 +30,12 @@ SEGMENT_EXAMPLES = """\
   gp-ground-seg plot segment 000000.bin --segment 90 -o ahead.pdf
   gp-ground-seg plot segment 000000.bin --segment 157,158 -o pair.png
 """
-TUNE = """\
-Show a scan in the browser, with sliders for the parameters. Labels follow at once,
-and points that change their class have a colour. With labels of SemanticKITTI, IoU and objects
-lost are shown too. A button writes the parameters as YAML, and shows the command that loads the
-file into a running node. The page is served to this machine only. Ctrl-C stops it.
-"""
-TUNE_EXAMPLES = """\
-  gp-ground-seg tune 000000.bin
-  gp-ground-seg tune KITTI_ROOT/sequences/00 --frame 5 -o kitti.yaml
-  gp-ground-seg tune drive.mcap --parameters sensor.height,faces.cell_size
-
-needs the package viser (docs/install.md)
-"""
 KINDS = ('.png', '.pdf', '.svg')
 ENDINGS = ' or '.join(KINDS)
 
 
 def add_parser(subparsers: options.Subparsers) -> None:
-    """Declare the commands, and the pictures of `plot`."""
+    """Declare the command and its pictures."""
     description = 'Draw a segmented scan: in perspective, or one segment of it.'
     examples = SCAN_EXAMPLES + SEGMENT_EXAMPLES
     parser = options.command(subparsers, 'plot', description, examples)
@@ -73,33 +56,17 @@ def add_parser(subparsers: options.Subparsers) -> None:
         ('--camera', 'where it stands, seen from the middle of the scene: counter-clockwise from '
          'ahead within 360 deg, upwards within 89 deg, 1 to 1000 m away (default: 196,24 and as '
          'near as the cloud is small)', {'metavar': 'AZIMUTH,ELEVATION,DISTANCE', 'type': camera}),
-        *of_both, purpose='a scan in perspective', run=run_plot,
+        *of_both, purpose='a scan in perspective', run=run,
     )  # fmt: skip
     options.command(
         pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES,
         ('--segment', 'number of the segment, or of several side by side',
          {'metavar': 'N[,N]', 'type': numbers, 'required': True}),
-        *of_both, purpose='a segment from the side', run=run_plot,
-    )  # fmt: skip
-    file, specs = {'metavar': 'FILE'}, tunable()
-    basic = [spec.name for spec in specs if spec.basic]
-    names = options.some_of(spec.name for spec in specs)
-    options.command(
-        subparsers, 'tune', TUNE, TUNE_EXAMPLES,
-        ('input', 'scan, folder of scans, sequence or bag', {'metavar': 'INPUT'}),
-        ('--labels', 'SemanticKITTI labels of a scan (default: those next to it)', file),
-        ('--frame', 'number of the first frame to show, from 0',
-         {**options.whole(0), 'default': 0}),
-        ('--port', 'of the page, or the next free one (default: %(default)s)',
-         {**options.NUMBER, 'default': 9090}),
-        ('--parameters', 'those to show (default: the basic ones)',
-         {'metavar': 'NAME,NAME', 'type': names, 'default': basic}),
-        ('-o --output', 'file to write (default: %(default)s)', {**file, 'default': 'tuned.yaml'}),
-        *options.CLOUDS, options.FORCE, options.QUIET, *options.CONFIG, run=run_tune,
+        *of_both, purpose='a segment from the side', run=run,
     )  # fmt: skip
 
 
-def run_plot(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Segment the scan and draw it."""
     config = options.read_config(arguments)
     path = Path(arguments.output)
@@ -133,26 +100,3 @@ def _can_look(view: list[float]) -> bool:
     """Whether a camera can look from there; straight from above no side of a picture is up."""
     azimuth, elevation, distance = view
     return abs(azimuth) <= 360.0 and abs(elevation) <= 89.0 and 1.0 <= distance <= 1000.0
-
-
-def run_tune(arguments: argparse.Namespace) -> int:
-    """Serve the page."""
-    inputs, config = options.list_clouds(arguments), options.read_config(arguments)
-    output, is_ours = Path(arguments.output), arguments.force
-    check_writable(output, force=is_ours)
-    load = f'ros2 param load /{NODE_NAME} {shlex.quote(str(output))}'
-
-    def write(values: Config) -> str:
-        nonlocal is_ours
-        text = values.to_yaml('Found with gp-ground-seg tune.')
-        write_file(output, text.encode(), force=is_ours)
-        is_ours = True
-        return f'written to {output}; a running node takes it by {load}'
-
-    with open_server(arguments.port) as (server, address):
-        begin = arguments.parameters, arguments.labels, arguments.frame
-        tuner = Tuner(server, inputs, config, *begin)
-        tuner.add_button(f'write {output.name}', write)
-        print(f'{address}\nCtrl-C ends it.', flush=True)
-        tuner.run()
-    return 0

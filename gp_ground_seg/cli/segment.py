@@ -100,11 +100,10 @@ def run(arguments: argparse.Namespace) -> int:
         try:
             found = runner.run(write, left)
         finally:
-            if parameters and not any(map(os.path.lexists, outputs)):  # it failed at once
+            if is_new and not any(map(os.path.lexists, outputs)):  # it failed at once
                 with suppress(OSError):  # another run may have written there
                     (folder / PARAMETERS).unlink()
-                    if is_new:
-                        folder.rmdir()
+                    folder.rmdir()
     _print_summary([*itertools.chain(*found)], target, runner.n_workers)
     options.note_spared(config, used)
     return 0
