@@ -352,14 +352,12 @@ def _on_slope(
         return np.concatenate([np.full((len(found), 1), -1), found[:, :-1]], axis=1)
 
     before = last(chosen)
-    rise = batch.z - batch.z[own, before]
-    distance = batch.r - batch.r[own, before]
+    rise, distance = (values - values[own, before] for values in (batch.z, batch.r))
     walkable = is_walkable(rise, distance, growth.max_slope) & ~batch.in_face & ~batch.above
-    is_open = (before >= 0) & (last(~chosen & ~fitting & ~walkable) < before)
-    line = batch.slope[own, before], batch.extent[own, before]
-    is_shown = carries_on(rise, distance, batch.onward, slope_before(*line, distance, growth))
-    is_shown &= is_open & walkable
-    return is_shown | (is_open & walkable & (rise <= 0.0)), is_shown
+    is_open = walkable & (before >= 0) & (last(~chosen & ~fitting & ~walkable) < before)
+    slope = slope_before(batch.slope[own, before], batch.extent[own, before], distance, growth)
+    is_shown = is_open & carries_on(rise, distance, batch.onward, slope)
+    return is_shown | (is_open & (rise <= 0.0)), is_shown
 
 
 @shared

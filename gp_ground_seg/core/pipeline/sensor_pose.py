@@ -263,21 +263,23 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
     than that would accept trunks, persons and cars as ground.
 
     These are the gates of the growth, the tolerance of ground and the least height of obstacles;
-    nothing for a sensor that is as high as `REFERENCE_HEIGHT`, or that is not seen to be lower.
+    the drift of the slope falls with the square, as less ground shows a slope. Nothing changes
+    for a sensor that is as high as `REFERENCE_HEIGHT`, or that is not seen to be lower.
     """
     share = sensor_height_of(pose) / REFERENCE_HEIGHT
     if share >= 1.0 or config.label.rule != 'roughness':
         return config
-    names = (
-        'grid.r_min',
-        'growth.seed_height_tolerance',
-        'growth.max_std',
-        'label.ground_tolerance',
-        'label.obstacle_min_height',
-    )
-    least = {name: float(find_spec(name).minimum or 0.0) for name in names}
+    powers = {
+        'grid.r_min': 1,
+        'growth.seed_height_tolerance': 1,
+        'growth.max_std': 1,
+        'label.ground_tolerance': 1,
+        'label.obstacle_min_height': 1,
+        'observation.slope_drift': 2,
+    }
+    least = {name: float(find_spec(name).minimum or 0.0) for name in powers}
     least['label.ground_tolerance'] = min(LEAST_TOLERANCE, config.label.ground_tolerance)
-    return config.replace(**{name: max(share * config[name], least[name]) for name in names})
+    return config.replace(**{n: max(share**k * config[n], least[n]) for n, k in powers.items()})
 
 
 def sensor_height_of(pose: SensorPose) -> float:
