@@ -262,24 +262,23 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
     height of the sensor, for example 0.4 m: far from the last ring on the ground, a gate wider
     than that would accept trunks, persons and cars as ground.
 
-    These are the gates of the growth, the tolerance of ground and the least height of obstacles;
-    the drift of the slope falls with the square, as less ground shows a slope. Nothing changes
-    for a sensor that is as high as `REFERENCE_HEIGHT`, or that is not seen to be lower.
+    These are the gates of the growth, the drift of slopes, the tolerance of ground and the least
+    height of obstacles; nothing for one as high as `REFERENCE_HEIGHT`, or not seen to be lower.
     """
     share = sensor_height_of(pose) / REFERENCE_HEIGHT
     if share >= 1.0 or config.label.rule != 'roughness':
         return config
-    powers = {
-        'grid.r_min': 1,
-        'growth.seed_height_tolerance': 1,
-        'growth.max_std': 1,
-        'label.ground_tolerance': 1,
-        'label.obstacle_min_height': 1,
-        'observation.slope_drift': 2,
-    }
-    least = {name: float(find_spec(name).minimum or 0.0) for name in powers}
+    names = (
+        'grid.r_min',
+        'growth.seed_height_tolerance',
+        'growth.max_std',
+        'label.ground_tolerance',
+        'label.obstacle_min_height',
+        'observation.slope_drift',
+    )
+    least = {name: float(find_spec(name).minimum or 0.0) for name in names}
     least['label.ground_tolerance'] = min(LEAST_TOLERANCE, config.label.ground_tolerance)
-    return config.replace(**{n: max(share**k * config[n], least[n]) for n, k in powers.items()})
+    return config.replace(**{name: max(share * config[name], least[name]) for name in names})
 
 
 def sensor_height_of(pose: SensorPose) -> float:
