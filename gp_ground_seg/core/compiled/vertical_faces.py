@@ -21,7 +21,6 @@ from gp_ground_seg.core.pipeline.vertical_faces import (
     SQUARE_SCATTERS,
     SUMS,
     face_height,
-    height_square,
     in_units,
     is_base_occluded,
     is_beyond_edge,
@@ -30,6 +29,7 @@ from gp_ground_seg.core.pipeline.vertical_faces import (
     is_steep,
     is_vertical,
     scatter_square,
+    slope_square,
     smooth_up_to,
     vote_on_scatter,
 )
@@ -89,7 +89,7 @@ def _mark_scattered(
 ) -> None:
     """Mark raised tiles about which many scatter. See the plain `vote_on_scatter`."""
     n, face, lifts = len(tall), face_height(label), np.full(len(tall), np.nan)
-    own, of_heights = np.full(n, UNKNOWN), np.full(n, UNKNOWN)
+    own = np.full(n, UNKNOWN)
     for k in range(n):
         low, high = tiles.extremes[tall[k], 0], tiles.extremes[tall[k], 1]
         over = np.float64(low) + height
@@ -98,14 +98,14 @@ def _mark_scattered(
         if over > 0.5 * face:
             lifts[k] = over
         elif over > -0.5 * face and np.float64(high) - np.float64(low) <= face:
-            own[k], of_heights[k] = square[k], height_square(sums[2 * k] + sums[2 * k + 1])
-    limit, limit_of_heights = _limit_of(own), _limit_of(of_heights)
+            own[k] = square[k]
+    limit = _limit_of(own)
     small = _squares_of_blocks(tiles, tall, sums, lifts, 1)
     large = _squares_of_blocks(tiles, tall, sums, lifts, 2)
     level = np.full(n, UNKNOWN_LEVEL, np.int32)
     for k in range(n):
         if lifts[k] > 0.0:
-            level[k] = vote_on_scatter(square[k], small[k], large[k], limit, limit_of_heights)
+            level[k] = vote_on_scatter(square[k], small[k], large[k], limit)
     about = levels_about(tiles.place[tall], level, int(math.sqrt(len(tiles.at))), SCATTERED, 0)
     for k in range(n):
         if level[k] != UNKNOWN_LEVEL and about[k] > 0 and lifts[k] > face:
@@ -134,7 +134,7 @@ def _squares_of_blocks(
         for i in range(SUMS):
             blocks[block[k], i] += sums[2 * k, i] + sums[2 * k + 1, i]
     for k in raised:
-        square[k] = scatter_square(blocks[block[k]], none)
+        square[k] = slope_square(blocks[block[k]], none)
     return square
 
 

@@ -143,11 +143,11 @@ def _scattered(
     """
     square, face = scatter_square(sums, np.zeros_like(sums)), face_height(label)
     is_own = ~is_face & (np.abs(over) < 0.5 * face) & (extent <= face)
-    limits = [_limit_of(squares[is_own]) for squares in (square, height_square(sums))]
+    limit = _limit_of(square[is_own])
     raised = np.flatnonzero(~is_face & (over > 0.5 * face))
     place = place[raised]
     small, large = (_squares_of_blocks(place, n_sides, sums[:, raised], n) for n in (1, 2))
-    vote = vote_on_scatter(square[raised], small, large, *limits)
+    vote = vote_on_scatter(square[raised], small, large, limit)
     about = levels_about(place, vote, n_sides, SCATTERED, 0)
     result: IntArray = raised[(vote != UNKNOWN_LEVEL) & (about > 0) & (over[raised] > face)]
     return result
@@ -168,7 +168,7 @@ def _squares_of_blocks(place: CellArray, n_sides: int, sums: FloatArray, shift: 
     column, row = np.divmod(as_index(place), n_sides)
     block = (column >> shift) * n_sides + (row >> shift)
     blocks = np.array([np.bincount(block, total)[block] for total in sums])
-    square: FloatArray = scatter_square(blocks, np.zeros_like(blocks))
+    square: FloatArray = slope_square(blocks, np.zeros_like(blocks))
     return square
 
 
@@ -283,29 +283,23 @@ def scatter_square(foot: FloatArray, rest: FloatArray) -> Values:
 
 
 @shared
-def height_square(sums: FloatArray) -> Values:
-    """Mean square of the heights of a tile about their mean [m^2]; `UNKNOWN` of few returns.
-
-    It bounds the scatter about a plane, also where a single ring crosses the tile.
-    """
-    n = np.maximum(sums[0], 1.0)
-    square = np.maximum(sums[6] - sums[3] * sums[3] / n, 0.0) / n
-    return choose(sums[0] >= MIN_RETURNS, square, UNKNOWN)
+def slope_square(sums: FloatArray, none: FloatArray) -> Values:
+    """Do what `scatter_square` does, of returns as steep as stairs; `UNKNOWN` of others."""
+    _, xx, yy, zz, xy, xz, yz = moments(sums, none)
+    up = normal_z(xx, yy, zz, xy, xz, yz)
+    return choose((up > 0.76) & (up < 0.94), scatter_square(sums, none), UNKNOWN)
 
 
 @shared
-def vote_on_scatter(
-    square: Values, small: Values, large: Values, limit: float, limit_of_heights: float
-) -> Values:
+def vote_on_scatter(square: Values, small: Values, large: Values, limit: float) -> Values:
     """Whether a raised tile scatters more than terrain: 1, or 0, or `UNKNOWN_LEVEL`.
 
     Squares of the scatter are of the tile, and of blocks of 1 and 2 m [m^2]. A tile of stairs may
     show one step alone, but a block scatters as much as one twice as large: both lie on one plane.
     """
     even = np.minimum(STEPS * STEPS, AS_EVEN * AS_EVEN * small)
-    least = limit_of_heights * limit_of_heights
-    is_stepped = (small > least) & (large > 0.0) & (large < even)
-    is_smooth = (square != UNKNOWN) | ((small != UNKNOWN) & (small <= least))
+    is_stepped = (small > SMOOTH * SMOOTH) & (large > 0.0) & (large < even)
+    is_smooth = (square != UNKNOWN) | ((small != UNKNOWN) & (small <= SMOOTH * SMOOTH))
     return choose(is_stepped | (square > limit * limit), 1, choose(is_smooth, 0, UNKNOWN_LEVEL))
 
 
