@@ -15,7 +15,7 @@ import lzf
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
-from gp_ground_seg.data.bags import POINT_CLOUD2, cloud_from_columns, encode_cloud
+from gp_ground_seg.data.bags import POINT_CLOUD2, cloud_from_points, encode_cloud
 
 XYZ = np.arange(12, dtype='f4').reshape(4, 3)
 RAW = XYZ.tobytes()
@@ -230,7 +230,7 @@ CASES |= {
 
 # MCAP: channels as (topic, encoding, schema, its encoding).
 
-CLOUD = encode_cloud(cloud_from_columns((1, 0), 'lidar', dict(zip('xyz', XYZ.T, strict=True))))
+CLOUD = encode_cloud(cloud_from_points(XYZ, 10**9, 'lidar'))
 POINTS = '/points', 'cdr', POINT_CLOUD2, 'ros2msg'
 LOG = '/log', 'protobuf', 'foxglove.Log', 'protobuf'
 NO_SUMMARY = {

@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.cli.demo import FRAME_ID
 from gp_ground_seg.cli.options import progress
-from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_stamp
+from gp_ground_seg.data.bags import cloud_from_points, decode_cloud, encode_cloud, with_stamp
+from gp_ground_seg.data.point_cloud2 import stamp_of
 from gp_ground_seg.data.semantic_kitti import frames
 from gp_ground_seg.lab.scoring.report import describe_environment, machine_line
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
@@ -58,7 +58,7 @@ class Probe:
             session.node.create_subscription(PointCloud2, topic, take, 50, raw=True)
 
     def _take(self, topic, raw, info):
-        back = self._back.setdefault(stamp_of(decode_cloud(raw)), {})
+        back = self._back.setdefault(stamp_of(decode_cloud(raw).header), {})
         back[topic] = info.get('received_timestamp') or time.time_ns()
         self._last_news = time.monotonic()
 
@@ -70,7 +70,7 @@ class Probe:
             raw = encode_cloud(cloud)
             while (left := due - time.monotonic()) > 0.0:
                 self._session.spin(left)
-            self._sent[stamp_of(cloud)] = time.time_ns()
+            self._sent[stamp_of(cloud.header)] = time.time_ns()
             self._publisher.publish(raw)
             on_sent()
             due += 1.0 / rate
@@ -97,7 +97,7 @@ class Probe:
 def restamped(clouds, start):
     """Yield clouds over and over, stamped every 0.1 s from the second `start` on."""
     for k, cloud in enumerate(itertools.cycle(clouds)):
-        yield with_stamp(cloud, (start + k // 10, k % 10 * 10**8))
+        yield with_stamp(cloud, 10**9 * start + 10**8 * k)
 
 
 def cpu_of(pid):
@@ -150,7 +150,7 @@ def main():
             simulate_scan(SCENES['urban'](1), SENSORS[given.sensor], np.random.default_rng(k), k)
             .points for k in range(N_SIMULATED)
         ]  # fmt: skip
-    clouds = [scan_cloud(points, 0, FRAME_ID) for points in scans]
+    clouds = [cloud_from_points(points, 0, FRAME_ID) for points in scans]
     n_points = sum(map(len, scans)) / len(scans)
     source = given.root or f'simulated {given.sensor}'
     print(f'{source}: {len(scans)} clouds of {n_points:.0f} points')

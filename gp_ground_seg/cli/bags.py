@@ -4,16 +4,13 @@ import argparse
 import math
 import time
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.data import bags
 from gp_ground_seg.data.bags import POINT_CLOUD2, BagReader
-from gp_ground_seg.data.point_cloud2 import CloudMessage
 from gp_ground_seg.data.semantic_kitti import list_frames
 from gp_ground_seg.ros.session import large_cloud_transport, needing_ros, ros_session
 
@@ -82,14 +79,6 @@ def add_parser(subparsers: options.Subparsers) -> None:
     )  # fmt: skip
 
 
-def scan_cloud(
-    points: npt.NDArray[np.float32], stamp_ns: int, frame_id: str, **further: npt.NDArray[Any]
-) -> CloudMessage:
-    """Return points (N, 4), x y z [m] intensity, and `further` fields (N,) as a cloud."""
-    columns = {name: points[:, k] for k, name in enumerate(('x', 'y', 'z', 'intensity'))}
-    return bags.cloud_from_columns(divmod(stamp_ns, 10**9), frame_id, {**columns, **further})
-
-
 def run_convert(arguments: argparse.Namespace) -> int:
     """Write the bag."""
     frames = list_frames(arguments.root, arguments.sequence, options.columns_of(arguments))
@@ -104,7 +93,8 @@ def run_convert(arguments: argparse.Namespace) -> int:
             points, labels = frame.points, {}
             if frame.labels_path is not None:
                 labels['label'] = frame.semantic.astype(np.uint32)
-            write(TOPIC, stamp, bags.encode_cloud(scan_cloud(points, stamp, FRAME_ID, **labels)))
+            cloud = bags.cloud_from_points(points, stamp, FRAME_ID, **labels)
+            write(TOPIC, stamp, bags.encode_cloud(cloud))
             n_points += len(points)
             n_labelled += len(labels)
     n_frames, n_all = options.count(len(frames), 'frame'), options.count(n_points, 'point')

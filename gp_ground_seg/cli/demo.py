@@ -9,15 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.core.errors import GroundSegError, in_thousands
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.data.bags import POINT_CLOUD2, BagReader, decode_cloud, encode_cloud, new_bag
+from gp_ground_seg.data import bags
 from gp_ground_seg.data.files import check_writable
 from gp_ground_seg.data.point_cloud2 import CloudMessage, read_fields, read_xyz
 from gp_ground_seg.lab.plotting import new_figure, plot_scan_view
 from gp_ground_seg.lab.scoring.metrics import Labels, count_labels, label_ratios, true_labels
-from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_scan
+from gp_ground_seg.lab.simulation import HDL_64E, SCENES, SEMANTIC_KITTI, simulate_scan
 from gp_ground_seg.ros.node_process import GROUND, OBSTACLES, Link, NodeProcess, private_session
 from gp_ground_seg.ros.session import Session, needing_ros
 
@@ -114,7 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
         with NodeProcess(folder / LOG, words) as node:
             _write(n_frames, folder / BAG, session)
             try:
-                with BagReader(folder / BAG) as bag:
+                with bags.BagReader(folder / BAG) as bag:
                     tally = _play(bag, n_frames, session, node)
             except GroundSegError as error:
                 print('the last lines of the log of the node:', *node.log_lines()[-LAST_LINES:],
@@ -137,25 +136,25 @@ def _write(n_frames: int, path: Path, session: Session) -> None:
     scans = f'{options.count(n_frames, "scan")} of a simulated street'
     print(f'[1/3] writing {scans} as a bag; meanwhile the node starts', flush=True)
     scene, rng = SCENES['urban'](SEED), np.random.default_rng(SEED)
-    with new_bag(path, {TOPIC: POINT_CLOUD2}, force=True) as write:
+    with bags.new_bag(path, {TOPIC: bags.POINT_CLOUD2}, force=True) as write:
         for k in options.progress('scans')(range(n_frames)):
             scan = simulate_scan(scene, HDL_64E, rng, x=SPEED * k * PERIOD)
             stamp = EPOCH * 10**9 + round(k * PERIOD * 1e9)
-            label = semantic_kitti_labels(scan.kind).astype(np.uint32)
-            cloud = scan_cloud(scan.points, stamp, FRAME_ID, label=label)
-            write(TOPIC, stamp, encode_cloud(cloud))
+            label = SEMANTIC_KITTI[scan.kind]
+            cloud = bags.cloud_from_points(scan.points, stamp, FRAME_ID, label=label)
+            write(TOPIC, stamp, bags.encode_cloud(cloud))
             session.check()
 
 
-def _play(bag: BagReader, n_frames: int, session: Session, node: NodeProcess) -> Tally:
+def _play(bag: bags.BagReader, n_frames: int, session: Session, node: NodeProcess) -> Tally:
     """Send the scans of a bag to the node."""
     print('[2/3] connecting to the node', flush=True)
     link = Link(session, node)
-    link.connect(decode_cloud(next(bag.messages([TOPIC]))[2]))
+    link.connect(bags.decode_cloud(next(bag.messages([TOPIC]))[2]))
     print('[3/3] sending the scans to the node, and receiving both clouds', flush=True)
     tally = Tally()
     for _, _, raw in options.progress('scans')(bag.messages([TOPIC]), total=n_frames):
-        cloud, started = decode_cloud(raw), time.monotonic()
+        cloud, started = bags.decode_cloud(raw), time.monotonic()
         back = link.ask(cloud)
         tally.add(cloud, back, time.monotonic() - started, node.is_compiled())
         session.sleep(max(0.0, started + PERIOD - time.monotonic()))

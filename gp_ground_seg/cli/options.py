@@ -80,7 +80,7 @@ def value(read: Callable[[str], Any], accepts: Callable[[Any], Any], wanted: str
 def whole(least: int) -> dict[str, Any]:
     """Return what `add_argument` takes of a whole number."""
     wanted = f'a whole number, at least {least}'
-    read = value(lambda text: text.isdecimal() and int(text), lambda n: n >= least, wanted)
+    read = value(lambda t: int(t) if t.isdecimal() else -1, lambda n: n >= least, wanted)
     return {'metavar': 'N', 'type': read}
 
 

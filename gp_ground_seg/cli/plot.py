@@ -47,7 +47,7 @@ def add_parser(subparsers: options.Subparsers) -> None:
     of_both: tuple[options.Option, ...] = (
         ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
         ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'}),
-        ('--frame', 'which of several, from 0 (default: 0)', {'metavar': 'N', 'type': int}),
+        ('--frame', 'which of several, from 0 (default: 0)', options.whole(0)),
         ('-o --output', f'{ENDINGS} file', {'metavar': 'OUT', 'required': True}),
         *options.CLOUDS, options.FORCE, *options.CONFIG,
     )  # fmt: skip

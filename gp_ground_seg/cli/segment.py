@@ -7,6 +7,7 @@ import itertools
 import os
 import statistics
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -74,11 +75,6 @@ def add_parser(subparsers: options.Subparsers) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the files of each input that are not written yet, and print a summary."""
-    if arguments.more:
-        raise DataError(
-            f'{arguments.more[0]}: a second input, where one is taken; for several: '
-            'for f in FILES; do gp-ground-seg segment "$f"; done'
-        )
     config, source = options.read_config(arguments), Path(arguments.input)
     target = Path(arguments.output or _default_output(source, arguments.format))
     scans, form, is_one = _list_scans(arguments, source, target)
@@ -94,14 +90,20 @@ def run(arguments: argparse.Namespace) -> int:
         print(f'{len(scans) - len(left)} of {len(scans)} were finished before')
     if not left:
         return 0
-    used = options.spare_compiling(config, len(left))
+    used, is_new = options.spare_compiling(config, len(left)), not folder.exists()
     write = partial(segment_scans, folder, form, used)
     if is_one and scans.topic:
         write = partial(segment_bag, target, used)
     with options.runner(arguments, 'segment') as runner:
         if parameters and (arguments.force or find_difference(folder, parameters)):
             files.write_file(folder / PARAMETERS, parameters.encode())
-        found = runner.run(write, left)
+        try:
+            found = runner.run(write, left)
+        finally:
+            if is_new and not any(map(os.path.lexists, outputs)):  # it failed at once
+                with suppress(OSError):  # another run may have written there
+                    (folder / PARAMETERS).unlink()
+                    folder.rmdir()
     _print_summary([*itertools.chain(*found)], target, runner.n_workers)
     options.note_spared(config, used)
     return 0
@@ -111,6 +113,11 @@ def _list_scans(
     arguments: argparse.Namespace, source: Path, target: Path
 ) -> tuple[Inputs, str | None, bool]:
     """Return what to segment, and the format of its files; whether they are one, or one bag."""
+    if arguments.more:
+        raise DataError(
+            f'{arguments.more[0]}: a second input, where one is taken; for several: '
+            'for f in FILES; do gp-ground-seg segment "$f"; done'
+        )
     form, suffix = arguments.format, target.suffix[1:]
     if semantic_kitti.is_root(source):
         if form not in (None, LABELS):

@@ -35,7 +35,7 @@ def add_parser(subparsers: options.Subparsers) -> None:
         ('input', 'scan, folder of scans, sequence or bag', {'metavar': 'INPUT'}),
         ('--labels', 'SemanticKITTI labels of a scan (default: those next to it)', file),
         ('--frame', 'number of the first frame to show, from 0',
-         {'metavar': 'N', 'type': int, 'default': 0}),
+         {**options.whole(0), 'default': 0}),
         ('--port', 'of the page, or the next free one (default: %(default)s)',
          {**options.NUMBER, 'default': 9090}),
         ('--parameters', 'those to show (default: the basic ones)',

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError, PointCloudError, in_one_line, require
-from gp_ground_seg.data.clouds import check_numbers, gather
+from gp_ground_seg.data.clouds import check_numbers, gather, name_columns, scatter
 from gp_ground_seg.data.files import naming, staged_file, writing
 from gp_ground_seg.data.point_cloud2 import DATATYPES, CloudMessage
 
@@ -279,10 +279,9 @@ def new_bag(
     what appends a message: its topic, the time when it was recorded [ns], and CDR bytes. Raises
     DataError if the path is taken or cannot be written, MissingDependencyError without rosbags.
     """
-    require('rosbags.highlevel', 'rosbags')
+    path, types = Path(path), jazzy_types()
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    path, types = Path(path), jazzy_types()
     if path.suffix == '.bag':
         raise DataError(f'{path}: only ROS 2 bags are written; use .mcap, .db3 or a folder')
     storage = STORAGE_OF_SUFFIX.get(path.suffix, storage)
@@ -305,22 +304,20 @@ def new_bag(
             os.rename(folder / f'{folder.name}{path.suffix}', product)
 
 
-def stamp_of(cloud: CloudMessage) -> tuple[int, int]:
-    """Seconds and nanoseconds of the header."""
-    return cloud.header.stamp.sec, cloud.header.stamp.nanosec
-
-
-def with_stamp(cloud: CloudMessage, stamp: tuple[int, int]) -> CloudMessage:
-    """Copy of a message with another stamp, in s and ns; the points are shared."""
+def with_stamp(cloud: CloudMessage, stamp: int) -> CloudMessage:
+    """Copy of a message with another stamp [ns]; the points are shared."""
     header = _new_header(stamp, cloud.header.frame_id)
     return dataclasses.replace(cloud, header=header)  # type: ignore[type-var]
 
 
-def cloud_from_columns(
-    stamp: tuple[int, int], frame_id: str, columns: Mapping[str, npt.NDArray[Any]]
+def cloud_from_points(
+    table: npt.NDArray[np.floating], stamp: int, frame_id: str, **further: npt.NDArray[Any]
 ) -> CloudMessage:
-    """Message with one float32 or uint32 field per column (N,), packed; `stamp` in s and ns."""
-    types = jazzy_types().types
+    """Message of points (N, >=3), x y z [m] intensity, with `further` fields (N,), packed.
+
+    Its fields are float32 or uint32; the `stamp` is in ns.
+    """
+    types, columns = jazzy_types().types, {**scatter(name_columns(table)), **further}
     codes = {name: f'{values.dtype.kind}4' for name, values in columns.items()}
     points = gather({name: values.astype(f'<{codes[name]}') for name, values in columns.items()})
     step, n_points = points.dtype.itemsize, len(points)
@@ -341,9 +338,10 @@ def cloud_from_columns(
     return cloud
 
 
-def _new_header(stamp: tuple[int, int], frame_id: str) -> Any:
+def _new_header(stamp: int, frame_id: str) -> Any:
     types = jazzy_types().types
-    return types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](*stamp), frame_id)
+    time = types['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9))
+    return types['std_msgs/msg/Header'](time, frame_id)
 
 
 def decode_cloud(raw: bytes | memoryview) -> CloudMessage:

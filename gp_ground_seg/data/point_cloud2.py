@@ -46,6 +46,11 @@ class CloudMessage(Protocol):
 _Message = TypeVar('_Message', bound=CloudMessage)
 
 
+def stamp_of(header: Any) -> int:
+    """Return the stamp of a header [ns]."""
+    return int(10**9 * header.stamp.sec + header.stamp.nanosec)
+
+
 def read_xyz(
     cloud: CloudMessage, *, is_single: bool = False
 ) -> npt.NDArray[np.float32] | npt.NDArray[np.float64]:

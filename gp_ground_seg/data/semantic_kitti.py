@@ -37,9 +37,9 @@ class Frame:
         return f'{self.sequence}/{self.index}'
 
     @property
-    def points(self) -> npt.NDArray[np.float32]:
-        """Points x, y, z [m], intensity, (N, 4); raises DataError as `read_points`."""
-        return read_points(self.points_path, self.columns)
+    def points(self) -> npt.NDArray[np.floating]:
+        """Points x, y, z [m], intensity, (N, 4) float32; raises DataError as `read_file`."""
+        return read_file(self.points_path, self.columns).xyz
 
     @property
     def entries(self) -> npt.NDArray[np.uint32]:
@@ -145,11 +145,6 @@ def _read_times(path: Path, frames: Sequence[Path]) -> list[float]:
     if not (np.isfinite(times).all() and (np.diff(times) > 0.0).all()):
         raise DataError(f'{path}: times must be numbers that increase')
     return [float(time) for time in times]
-
-
-def read_points(path: str | Path, columns: int = KITTI_COLUMNS) -> npt.NDArray[np.float32]:
-    """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4); DataError as `read_file`."""
-    return read_file(Path(path), columns).xyz.astype(np.float32, copy=False)
 
 
 def read_entries(path: str | Path, n_points: int) -> npt.NDArray[np.uint32]:

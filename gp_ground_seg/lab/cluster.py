@@ -126,6 +126,8 @@ def open_runner(
     if scheduler is not None:
         distributed = _quiet_distributed()
         try:  # with the keys of Dask's configuration
+            # A client of an address that cannot be one would wait 20 s for its own end.
+            distributed.comm.parse_host_port(distributed.comm.parse_address(scheduler)[1])
             client = distributed.Client(scheduler, set_as_default=False, timeout=CONNECT_TIMEOUT)
         except (OSError, ValueError, TypeError, MemoryError) as error:  # memory: no Dask is there
             said = f'does not answer ({errors.in_one_line(error)})'

@@ -15,7 +15,8 @@ from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config, DiagnosticsConfig
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.core.result import Segmentation
-from gp_ground_seg.ros.input import STEADY_CLOCK, CloudSubscription, stamp_of
+from gp_ground_seg.data.point_cloud2 import stamp_of
+from gp_ground_seg.ros.input import STEADY_CLOCK, CloudSubscription
 
 RATE_WINDOW = 10.0  # time over which the rate is taken [s]
 LOG_PERIOD = 60.0  # time between two lines of the log on the clouds so far [s]

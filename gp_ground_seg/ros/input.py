@@ -14,9 +14,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Header
 
 from gp_ground_seg.core.errors import ConfigError
+from gp_ground_seg.data.point_cloud2 import stamp_of
 
 CLOUD_TYPE = 'sensor_msgs/msg/PointCloud2'
 INPUT_DEPTH = 1  # clouds that may wait to be processed: the newest only
@@ -240,8 +240,3 @@ class CloudSubscription:
             )
             words = f'listening to {self.topic} ({self.qos_words})'
         self._node.get_logger().info(words)
-
-
-def stamp_of(header: Header) -> int:
-    """Return the stamp of a header [ns]."""
-    return int(10**9 * header.stamp.sec + header.stamp.nanosec)

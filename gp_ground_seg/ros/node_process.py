@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 
 from gp_ground_seg.core.errors import GroundSegError
-from gp_ground_seg.data.bags import decode_cloud, encode_cloud, stamp_of, with_stamp
-from gp_ground_seg.data.point_cloud2 import CloudMessage
+from gp_ground_seg.data.bags import decode_cloud, encode_cloud, with_stamp
+from gp_ground_seg.data.point_cloud2 import CloudMessage, stamp_of
 from gp_ground_seg.ros.loader import CHANGED, child_command
 from gp_ground_seg.ros.session import (
     Session,
@@ -107,7 +107,7 @@ class Link:
         from sensor_msgs.msg import PointCloud2
 
         self._session, self._node = session, node
-        self._back: dict[tuple[int, int], dict[str, CloudMessage]] = {}
+        self._back: dict[int, dict[str, CloudMessage]] = {}
         self._publisher = session.publisher_of_clouds(INPUT, DEPTH)
         for topic in OUTPUTS:
             take = partial(self._take, topic)
@@ -120,7 +120,7 @@ class Link:
         twice as long to answer: it shares the processor with its compiler, and each cloud that is
         sent again is work for it.
         """
-        first, patience = with_stamp(cloud, (1, 0)), 0.5
+        first, patience = with_stamp(cloud, 10**9), 0.5
         while patience < LONGEST_WAIT and not self._is_answered(first, patience):
             patience *= 2.0
         self.ask(first)
@@ -130,17 +130,17 @@ class Link:
         if not self._is_answered(cloud, LONGEST_WAIT):
             topics = ' and '.join(OUTPUTS)
             raise GroundSegError(f'no answer on {topics} within {LONGEST_WAIT:g} s')
-        return self._back.pop(stamp_of(cloud))
+        return self._back.pop(stamp_of(cloud.header))
 
     def _is_answered(self, cloud: CloudMessage, patience: float) -> bool:
         self._publisher.publish(encode_cloud(cloud))
 
         def is_back() -> bool:
             self._node.check()
-            return len(self._back.get(stamp_of(cloud), ())) == len(OUTPUTS)
+            return len(self._back.get(stamp_of(cloud.header), ())) == len(OUTPUTS)
 
         return self._session.wait_for(is_back, patience)
 
     def _take(self, topic: str, raw: bytes) -> None:
         cloud = decode_cloud(raw)
-        self._back.setdefault(stamp_of(cloud), {})[topic] = cloud
+        self._back.setdefault(stamp_of(cloud.header), {})[topic] = cloud

@@ -29,8 +29,8 @@ from gp_ground_seg.data.point_cloud2 import (
     read_columns,
     read_xyz,
     select_points,
+    stamp_of,
 )
-from gp_ground_seg.ros.input import stamp_of
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""

@@ -25,7 +25,8 @@ from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.core.parameters.config import NO_FRAME, Config
 from gp_ground_seg.core.pipeline.points import angles_of
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
-from gp_ground_seg.ros.input import STEADY_CLOCK, stamp_of
+from gp_ground_seg.data.point_cloud2 import stamp_of
+from gp_ground_seg.ros.input import STEADY_CLOCK
 
 KEPT_JUMP = 1.0  # after a longer jump back in time, transforms are forgotten [s]
 MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]

@@ -20,7 +20,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.cli import bags
-from gp_ground_seg.data.bags import decode_cloud, stamp_of
+from gp_ground_seg.data.bags import decode_cloud
+from gp_ground_seg.data.point_cloud2 import stamp_of
 from gp_ground_seg.ros import session
 
 
@@ -95,7 +96,7 @@ def test_loop_until_interrupted(tmp_path):
             wait_for_clouds(listener.clouds['/points'], 7)
             wait_for(lambda: any((t - START) % PERIOD for t in listener.clock()), 'time between')
         wait_for(lambda: listener.n_publishers() == 0, 'farewell')
-    stamps = [stamp_of(decode_cloud(raw)) for raw in listener.clouds['/points']]
+    stamps = [stamp_of(decode_cloud(raw).header) for raw in listener.clouds['/points']]
     assert stamps == list(itertools.islice(itertools.cycle(stamps[:3]), len(stamps)))
     # It is the time of the bag, also between clouds, and in each round begins again.
     assert (np.diff(listener.clock()) < 0).sum() >= 2

@@ -15,11 +15,10 @@ from cli_runner import PATIENCE, children, is_running, start, until_ctrl_c, wait
 from conftest import REPOSITORY
 
 from gp_ground_seg.cli import demo
-from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.cli.demo import Tally
 from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.data.bags import decode_cloud
+from gp_ground_seg.data.bags import cloud_from_points, decode_cloud
 from gp_ground_seg.data.point_cloud2 import select_points
 from gp_ground_seg.ros import loader, session
 from gp_ground_seg.ros.node_process import NodeProcess, private_session
@@ -31,7 +30,8 @@ def test_labels_are_scored():
     is_road = np.arange(40) % 2 == 0
     semantic = np.where(is_road, 40, 10).astype(np.uint32)
     points[3, 2], semantic[1] = np.nan, 1
-    cloud, tally = scan_cloud(points, 5_000_000_007, demo.FRAME_ID, label=semantic), Tally()
+    cloud = cloud_from_points(points, 5_000_000_007, demo.FRAME_ID, label=semantic)
+    tally = Tally()
 
     def back(is_ground):
         """What a right node makes of it: the point that is not finite in neither cloud."""

@@ -37,7 +37,7 @@ ONE = scan().tobytes()
 FILES = {
     'scan.npy': XYZ, 'many/1.npy': XYZ, 'many/2.npy': XYZ, 'good/000000.bin': ONE,
     'root/sequences/00/velodyne/000000.bin': ONE, 'root/sequences/08/velodyne/000000.bin': ONE,
-    'six.bin': np.hstack([XYZ, XYZ % 1]).astype('f4').tobytes(), 'cut.bin': bytes(17),
+    'six.bin': np.hstack([XYZ, XYZ % 1]).astype('f4').tobytes(), 'bad/cut.bin': bytes(17),
     'scan.txt': b'1 2 3', 'notes.md': b'mine', 'none/a.las': b'', 'taken.pcd': b'mine',
     'old.png': b'mine', 'mine/000000.label': b'mine', 'a.label': b'', 'a#2?.db3': b'',
     'packed.pcd': pcd(data='binary_compressed', body=struct.pack('<II', 9, 48) + bytes(9)),
@@ -49,7 +49,8 @@ MISTAKES = {
     'segment s3://bucket/kitti -o out': 's3:/bucket/kitti: no such file or folder',
     'segment scan.txt': 'scan.txt: not a scan or bag; accepted are .*; of a text, save x, y, z as',
     'segment none': r'none: no \.bin, .* file in it, and not a rosbag2 folder',
-    'segment cut.bin -o new.label': 'cut.bin: 17 bytes .*: truncated. --columns chooses another',
+    'segment bad -o new': 'bad/cut.bin: 17 bytes is not a whole number of points',
+    'segment bad/cut.bin -o new.label': 'bad/cut.bin: 17 bytes .*: truncated. --columns ch',
     'segment six.bin -o new.label': 'six.bin: read with 4 columns .*: use --columns 6',
     'segment scan.npy --columns 3': '--columns: is for .bin scans, which scan.npy is not',
     'segment drive.mcap --columns 5': '--columns: is for .bin scans',
@@ -82,6 +83,7 @@ MISTAKES = {
     'plot scan scan.npy': 'the following arguments are required: -o/--output; see gp-ground-seg p',
     'plot scan scan.npy -o a.gif': 'a.gif: must end in .png or .pdf or .svg',
     'plot scan scan.npy -o old.png': 'old.png: exists already; --force replaces it',
+    'plot scan many -o a.png --frame x': "--frame: 'x': must be a whole number, at least 0",
     'plot scan many -o a.png --frame 2': '--frame 2: must be 0 to 1 here',
     'plot scan drive.mcap -o a.png --frame 3': '--frame 3: must be 0 to 2 here',
     'plot scan scan.npy -o a.png --labels a.label': 'a.label: 0 bytes, expected 7200 for 1800 poi',
@@ -169,7 +171,7 @@ def test_mistakes_are_one_line_with_the_next_step_and_change_nothing(
         return {path: path.is_file() and path.read_bytes() for path in inputs.rglob('*')}
 
     monkeypatch.chdir(inputs)
-    monkeypatch.setattr(semantic_kitti, 'read_points', None)  # they stop before any frame is read
+    monkeypatch.setattr(semantic_kitti, 'read_file', None)  # they stop before any frame is read
     monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT', 0.5)
     before, (missing, _, words) = content(), line.rpartition('! ')
     if missing:

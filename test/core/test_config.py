@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from gp_ground_seg import Config, ConfigError, GroundSegmenter
 from gp_ground_seg.cli.options import parse_setting
 from gp_ground_seg.core.parameters.config import config_of, find_spec, parameter_specs
-from gp_ground_seg.core.parameters.schema import numbers_of
+from gp_ground_seg.core.parameters.schema import flatten, numbers_of
 
 SPECS = parameter_specs()
 NUMBERS = [spec for spec in SPECS if spec.type in (int, float)]
@@ -161,11 +161,11 @@ def test_groups_given_whole_are_checked_and_converted():
 def test_forms_agree_and_no_change_but_in_a_copy(config, other):
     with pytest.raises(dataclasses.FrozenInstanceError):
         config.label.ground_tolerance = 1.0
-    config.flat()['label.ground_tolerance'] = config.nested()['label']['ground_tolerance'] = 9.0
-    flat = config.flat()
-    assert config.replace(**other.flat()) == other
+    config.nested()['label']['ground_tolerance'] = 9.0
+    flat = flatten(config.nested())
+    assert config.replace(**flatten(other.nested())) == other
     assert config.replace() == config.replace(sensor={}) == config
-    assert config.flat() == flat
+    assert flatten(config.nested()) == flat
     assert list(flat) == [spec.name for spec in SPECS]
     nested = config.nested()
     for name, value in flat.items():

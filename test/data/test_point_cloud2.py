@@ -13,14 +13,8 @@ from hypothesis import strategies as st
 
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.data import point_cloud2
-from gp_ground_seg.data.bags import (
-    cloud_from_columns,
-    encode_cloud,
-    jazzy_types,
-    stamp_of,
-    with_stamp,
-)
-from gp_ground_seg.data.point_cloud2 import read_columns, read_fields, read_xyz
+from gp_ground_seg.data.bags import cloud_from_points, encode_cloud, jazzy_types, with_stamp
+from gp_ground_seg.data.point_cloud2 import read_columns, read_fields, read_xyz, stamp_of
 
 FLOAT32, FLOAT64 = 7, 8
 STRUCT_CODES = dict(enumerate('bBhHiIfd', 1))
@@ -33,7 +27,7 @@ Field = jazzy_types().types['sensor_msgs/msg/PointField']
 
 
 def cloud_of(height, width, fields, is_bigendian, point_step, row_step, data):
-    empty = cloud_from_columns((0, 0), 'lidar', {})
+    empty = cloud_from_points(np.empty((0, 4)), 0, 'lidar')
     return dataclasses.replace(
         empty, height=height, width=width, fields=fields, is_bigendian=is_bigendian,
         point_step=point_step, row_step=row_step, data=data,
@@ -145,7 +139,7 @@ def test_coordinates_side_by_side_are_not_copied():
 
 
 def test_what_is_not_needed_is_not_checked():
-    cloud = cloud_from_columns((0, 0), 'lidar', {})
+    cloud = cloud_from_points(np.empty((0, 4)), 0, 'lidar')
     assert read_xyz(dataclasses.replace(cloud, fields=[])).shape == (0, 3)
     assert point_cloud2.select_points(cloud, np.zeros(0, dtype=bool)).width == 0
     layout = kitti_layout(row_step=0)
@@ -201,9 +195,9 @@ def test_selection_and_another_stamp_keep_all_else():
     mask = np.isfinite(read_xyz(cloud)).all(axis=1)
     data = cloud.data.reshape(-1, cloud.point_step)[mask].ravel()
     shape = {'width': mask.sum(), 'row_step': len(data), 'data': data, 'is_dense': True}
-    selected, moved = point_cloud2.select_points(cloud, mask), with_stamp(cloud, (7, 8))
+    selected, moved = point_cloud2.select_points(cloud, mask), with_stamp(cloud, 7_000_000_008)
     assert not point_cloud2.select_points(cloud, ~mask).is_dense
-    assert (stamp_of(moved), moved.header.frame_id) == ((7, 8), 'velo_link')
+    assert (stamp_of(moved.header), moved.header.frame_id) == (7_000_000_008, 'velo_link')
     for found, expected in (
         (selected, dataclasses.replace(cloud, **shape)),
         (dataclasses.replace(moved, header=cloud.header), cloud),

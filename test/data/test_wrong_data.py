@@ -6,7 +6,6 @@ from conftest import simulated
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.cloud_files import find_objection, read_file
-from gp_ground_seg.data.semantic_kitti import read_points
 
 
 def missing(points, share, value):
@@ -47,7 +46,7 @@ def scans(request):
     if request.param == 'kitti':
         root = request.getfixturevalue('kitti')
         paths = sorted(root.glob('sequences/*/velodyne/*.bin'))
-        return [read_points(path) for path in paths[::6]]
+        return [read_file(path).xyz for path in paths[::6]]
     return [simulated(scene, request.param, 1).points for scene in ('flat', 'rough', 'urban')]
 
 
@@ -61,7 +60,7 @@ def test_wrong_data_are_refused_in_a_line_that_names_the_option(scans, tmp_path,
         make, problem = WRONG[change]
         path.write_bytes(make(points).tobytes())
         with pytest.raises(DataError, match=f'{path}: .*{problem}.*; a .bin holds float32: --col'):
-            read_points(path)
+            read_file(path)
 
 
 def test_the_line_for_a_map_can_be_followed(tmp_path):
@@ -91,7 +90,7 @@ def test_another_number_of_columns_is_seen(scans, tmp_path, columns, order):
         for extra in (*more, rng.integers(0, 256, (len(points), 7)))[: 2 + (order == 'none')]:
             table = np.hstack([points[:, :3], extra])[:, :columns].astype('<f4')
             table.tofile(path)
-            read = read_points(path, columns)
+            read = read_file(path, columns).xyz
             assert (read.dtype, read.flags.writeable) == (np.float32, True)
             four = np.zeros((len(points), 4))
             four[:, : min(columns, 4)] = table[:, :4]
@@ -99,7 +98,7 @@ def test_another_number_of_columns_is_seen(scans, tmp_path, columns, order):
             for wrong in (n for n in range(3, 11) if columns % n and n % columns):
                 n_wrong += 1
                 try:
-                    read_points(path, wrong)
+                    read_file(path, wrong)
                 except DataError as error:
                     n_named += f'use --columns {columns}' in str(error)
     assert n_named >= 0.9 * n_wrong
@@ -123,4 +122,4 @@ def test_beams_in_turns_and_lost_returns_are_no_other_columns(tmp_path, sensor):
         lost = (rng.random(len(points)) < share)[:, None] & (np.arange(4) < 3)
         table = np.where(lost, np.float32(0.0), points)[: len(points) // 840 * 840]
         table.tofile(path)
-        np.testing.assert_array_equal(read_points(path), table)
+        np.testing.assert_array_equal(read_file(path).xyz, table)

@@ -18,7 +18,7 @@ from gp_ground_seg.lab.scoring.objects import CLASSES, count_objects
 from gp_ground_seg.lab.scoring.peers import ground_points
 from gp_ground_seg.lab.scoring.report import records
 from gp_ground_seg.lab.scoring.tables import time_tables
-from gp_ground_seg.lab.simulation import Kind, semantic_kitti_labels
+from gp_ground_seg.lab.simulation import SEMANTIC_KITTI, Kind
 from gp_ground_seg.lab.simulation.objects import object_heights
 
 
@@ -140,7 +140,7 @@ SEGMENTS, ROAD = (90, 91), 40
 def test_columns_of_table_1_follow_their_definitions(tmp_path, monkeypatch):
     """Rubble ahead, from segment 90 on; all anew from two segmentations, but for the times."""
     made = simulated('road_then_rubble', 'hdl-32e', seed=1)
-    semantic = semantic_kitti_labels(made.kind)
+    semantic = SEMANTIC_KITTI[made.kind]
     write_frame(tmp_path, '00', 0, made.points, semantic)
     monkeypatch.setattr(table1, 'CHOICES', {('00', '000000'): SEGMENTS})
     monkeypatch.setattr(table1, 'N_REPEATS', 1)

@@ -17,6 +17,7 @@ from ros_helpers import bench, street, to_message
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.config import find_spec, parameter_specs
+from gp_ground_seg.core.parameters.schema import flatten
 from gp_ground_seg.ros.loader import CHANGED
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
@@ -35,7 +36,7 @@ DEFAULTS = {name: Config()[name] for name in ros.PATIENT}
 @pytest.fixture(scope='module')
 def shared():
     with bench(DEFAULTS) as b:
-        assert values_of(b) == Config().flat()
+        assert values_of(b) == flatten(Config().nested())
         yield b
 
 
@@ -48,7 +49,7 @@ def b(shared):
 
 def assert_loaded(b, config):
     """Load a configuration over any other."""
-    assert all(result.successful for result in b.load(config.flat()))
+    assert all(result.successful for result in b.load(flatten(config.nested())))
     assert b.node.config == config
 
 
@@ -128,7 +129,7 @@ def test_a_bad_value_is_refused_with_a_reason_and_changes_nothing(b, name):
     for value in others:
         said = b.set(name, value)
         assert said.startswith(f'{name} = ') and said.endswith(reason.split('must be')[1])
-    assert values_of(b) == b.node.config.flat() == Config().flat()
+    assert values_of(b) == flatten(b.node.config.nested()) == flatten(Config().nested())
 
 
 @pytest.mark.parametrize('name', ['sensor.height', 'sensor.roll', 'sensor.pitch'])
@@ -149,11 +150,11 @@ def test_several_at_once_are_all_taken_or_none(b):
     refused = set_all(n_segments=90, r_min=40.0, r_max=30.0)
     assert not refused.successful
     assert 'grid.r_min = 40: must be below grid.r_max = 30' in refused.reason
-    assert values_of(b) == Config().flat()
+    assert values_of(b) == flatten(Config().nested())
     # Neither of these could come alone after the other way round.
     assert set_all(r_min=40.0, r_max=49.0).successful
     assert set_all(r_max=30.0, r_min=1.0).successful
-    assert values_of(b) == {**Config().flat(), 'grid.r_min': 1.0, 'grid.r_max': 30.0}
+    assert values_of(b) == {**flatten(Config().nested()), 'grid.r_min': 1.0, 'grid.r_max': 30.0}
     # Of a file, the good ones: one by one, r_min comes after the r_max that it has to be below.
     asked = {'label.ground_tolerance': 9.0, 'grid.r_max': 50.0, 'grid.r_min': 40.0}
     results = b.load(asked)

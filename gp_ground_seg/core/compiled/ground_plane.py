@@ -1,6 +1,7 @@
 """Loops of `gp_ground_seg.core.pipeline.ground_plane` for compiled code."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -12,16 +13,15 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     LEAST_REACH,
     GroundPlane,
     Loops,
-    Moments,
     Plane,
     best_of,
     crossing_of,
     distance,
+    is_possible,
     levelness,
     planes_of,
-    refined,
     refutation_by,
-    set_hypotheses,
+    solve_plane,
     support_by,
     tukey_weight,
 )
@@ -38,9 +38,6 @@ from gp_ground_seg.core.pipeline.lowest_points import (
 def find_planes(candidates: Candidates, max_slope: float) -> Iterator[GroundPlane]:
     """Do what `gp_ground_seg.core.pipeline.ground_plane.find_planes` does, to rounding."""
     return planes_of(lowest_points(candidates), max_slope, _LOOPS)
-
-
-_LOOPS = Loops(jit(entry=True)(set_hypotheses), jit(entry=True)(best_of), jit(entry=True)(refined))
 
 
 @compiled_form(ground_plane.supports_of)
@@ -85,8 +82,19 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     return refutation
 
 
-@compiled_form(ground_plane.weighted_moments, fastmath=True)
-def weighted_moments(cells: LowestPoints, plane: Plane) -> Moments:
+@compiled_form(ground_plane.refine)
+def refine(cells: LowestPoints, planes: FloatArray, max_slope: float, n_steps: int) -> None:
+    """Weighted least squares with Tukey's weights of the plane before, again and again."""
+    for p in range(len(planes)):
+        plane = (planes[p, 0], planes[p, 1], planes[p, 2])
+        for _ in range(n_steps):
+            plane = solve_plane(_weighted_moments(cells, plane), plane)
+        if is_possible(plane, max_slope):
+            planes[p] = plane
+
+
+@jit(fastmath=True)
+def _weighted_moments(cells: LowestPoints, plane: Plane) -> Any:
     """Return the moments of the points with Tukey's weights; a loop that adds in any order."""
     w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for c in range(len(cells.x)):
@@ -102,3 +110,6 @@ def weighted_moments(cells: LowestPoints, plane: Plane) -> Moments:
         wxz += weight * x * z
         wyz += weight * y * z
     return w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz
+
+
+_LOOPS = Loops(jit(entry=True)(best_of), jit(entry=True)(refine))

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,12 +28,12 @@ from gp_ground_seg.core.gp.kernels import (
     Padded,
     add_noise,
     batches,
-    inverse_of_lower,
     line_covariance,
     line_variances,
     paciorek,
     prior_variance,
     single_threaded_blas,
+    whitened,
 )
 from gp_ground_seg.core.gp.latent import (
     given_log_length_scales,
@@ -127,6 +126,8 @@ MOST_DOUBT = 30.0
 ROUNDING, ROUNDING_SINGLE = 1e-12, 1e-6
 """Least noise of what is observed, in parts of the largest covariance: its rounding, in double and
 in single precision. With less, a predicted variance could be negative."""
+FARTHEST = 1e15
+"""Height over which all are equally far from a surface [m]: single precision holds its square."""
 RISES_ON = 0.8
 """Part of the slope to a candidate with which the ground behind it must rise on."""
 
@@ -245,121 +246,63 @@ def grow_inliers(
     a candidate among others, or that joins in doubt, shows less: see `noise_among` and
     `noise_in_doubt`. Where the ground carries on to it there is no doubt.
     """
-    candidates, z = frame.candidates, frame.candidates.z - frame.prior_mean
+    candidates, segment = frame.candidates, frame.candidates.segment
+    z, chosen, growth = candidates.z - frame.prior_mean, found.inlier, model.growth
     sill, gate_noise = variances_of(frame, theta, model.observation, ROUNDING_SINGLE)
     found.alike[:] = _count_near(candidates, np.exp(theta[3]) if model.by_roughness else 0.0)
-    noise, beside = noise_among(found.alike, gate_noise), at_candidates(from_neighbours, frame)
-    above = contradicts(*beside, z, gate_noise)
-    lines = frame.lines
-    extent = candidates.r - candidates.r[lines.start[lines.line]]
-    found.inlier[:], found.doubt[:] = False, 0.0
-    for segments in batches(np.arange(0, candidates.n_segments, step), candidates.offsets):
-        layout = Padded.of(segments, candidates.offsets)
-        place, mask = layout.place, layout.mask
-        state = _Batch(
-            layout.take(candidates.r).astype(np.float32),
-            np.exp(layout.take(found.log_length_scale)).astype(np.float32),
-            sill,
-            model.observation,
-            layout.take(z),
-            gate_noise,
-            layout.take(noise),
-            mask,
-            (found.seed & ~above)[place] & mask,
-            layout.take(frame.onward, -np.inf),
-            lines.slope[lines.line[place]],
-            extent[place],
-            frame.in_face[place],
-            above[place],
-            Evidence(layout.take(beside.height), layout.take(beside.precision)),
-        )
-        chosen = _grow(state, model)
-        found.inlier[place[mask]] = chosen[mask]
-        found.doubt[place[mask]] = state.noise[mask] - noise[place[mask]]
-
-
-class _Batch(NamedTuple):
-    """Candidates of S segments, padded to n."""
-
-    r: FloatArray  # (S, n)
-    length_scale: FloatArray  # (S, n)
-    sill: float
-    observation: ObservationConfig
-    z: FloatArray  # (S, n) about the prior mean
-    gate_noise: float  # variance of the noise of a candidate
-    # (S, n) variance of that with which it is observed; grows where it joins in doubt
-    noise: FloatArray
-    mask: BoolArray  # (S, n)
-    seed: BoolArray  # (S, n)
-    onward: FloatArray  # (S, n)
-    slope: FloatArray  # (S, n) that of its line
-    extent: FloatArray  # (S, n) how far its line reaches back
-    in_face: BoolArray  # (S, n)
-    above: BoolArray  # (S, n) the evidence contradicts it
-    from_neighbours: Evidence  # (S, n)
-
-
-@np.errstate(over='ignore', invalid='ignore')  # the square of 1e200 m: no fit; -inf times 0
-def _grow(batch: _Batch, model: Model) -> BoolArray:
-    """Inliers of each segment, (S, n).
-
-    If ``label.rule`` is roughness, doubt changes their noise (see `noise_in_doubt`). Candidates
-    that join in a round are conditioned on at once: their rows of ``L^-1 K(inliers, candidates)``
-    are appended to those of the rounds before, and nothing is factored twice.
-    """
-    chosen = np.zeros_like(batch.seed)
-    variance = prior_variance(batch.sill, batch.observation, batch.r)
-    height = np.zeros_like(batch.r)
-    # Segments that still grow, and the whitened rows of their inliers.
-    active, joining = np.arange(len(chosen)), batch.seed
-    whitened = np.empty((len(chosen), 0, variance.shape[1]), variance.dtype)
-    if model.by_roughness:
-        predicted = combined(0.0, variance, *batch.from_neighbours)
-        doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, True)
-        batch.noise[:] = np.where(joining & batch.in_face, doubtful, batch.noise)
-    while len(active):
-        chosen |= joining
-        if joining.any():
-            whitened = _condition(batch, active, joining[active], whitened, height, variance)
-        predicted = combined(height, variance, *batch.from_neighbours)
-        fitting = fits(batch.z, *predicted, batch.gate_noise, model.growth)
-        # Before anything has joined, only the evidence of neighbours decides.
-        may_join = ~chosen & batch.mask
-        may_join &= chosen.any(axis=1, keepdims=True) | (batch.from_neighbours.precision > 0.0)
-        on_slope, is_shown = _on_slope(batch, chosen, fitting, model.growth)
-        if model.by_roughness:
-            doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, batch.in_face)
-            batch.noise[:] = np.where(may_join & fitting & ~is_shown, doubtful, batch.noise)
-        joining = may_join & (fitting | on_slope)
-        grows = joining[active].any(axis=1)
-        active, whitened = active[grows], whitened[grows]
-    return chosen
+    certain, beside = noise_among(found.alike, gate_noise), at_candidates(from_neighbours, frame)
+    above, noise, is_own = contradicts(*beside, z, gate_noise), certain.copy(), segment % step == 0
+    blocks = _prior_blocks(frame, found.log_length_scale, sill, model.observation, step)
+    height, variance = np.zeros(len(z)), prior_variance(sill, model.observation, candidates.r)
+    predicted, stops = combined(height, variance, *beside), frame.in_face | above
+    chosen[:], joining = False, found.seed & ~above & is_own
+    in_doubt, has_inliers = joining & frame.in_face, np.zeros(candidates.n_segments, np.bool_)
+    with np.errstate(over='ignore', invalid='ignore'):  # the square of 1e200 m: no fit
+        while True:
+            if model.by_roughness:
+                of_these = (values[in_doubt] for values in (z, *predicted, noise, frame.in_face))
+                noise[in_doubt] = noise_in_doubt(*of_these)
+            chosen |= joining
+            for layout, table in blocks:
+                if joining[layout.place].any():
+                    which, given, spread = _condition(layout, table, joining, noise)
+                    height[which], variance[which] = z[which] - given, spread
+            predicted = combined(height, variance, *beside)
+            fitting = fits(z, *predicted, gate_noise, growth)
+            on_slope, is_shown = _on_slope(frame, chosen, fitting, stops, growth)
+            # Before anything has joined, only the evidence of neighbours decides.
+            has_inliers[segment[joining]] = True
+            may_join = ~chosen & is_own & (has_inliers[segment] | (beside.precision > 0.0))
+            joining, in_doubt = may_join & (fitting | on_slope), may_join & fitting & ~is_shown
+            if not joining.any():
+                break
+    found.doubt[:] = noise - certain
 
 
 def _on_slope(
-    batch: _Batch, chosen: BoolArray, fitting: BoolArray, growth: GrowthConfig
+    frame: Frame, chosen: BoolArray, fitting: BoolArray, stops: BoolArray, growth: GrowthConfig
 ) -> tuple[BoolArray, BoolArray]:
-    """Candidates to which the ground goes on from the last of those `chosen`, (S, n).
+    """Candidates to which the ground goes on from the last of those `chosen`, (C,).
 
     Of the second ones the returns behind or before them show that it rises. Behind one that stands
-    on it, or is in a face, it does not go on, until the next that is chosen.
+    on it, or is one of `stops`, it does not go on, until the next that is chosen.
     """
-    own, place = np.arange(len(chosen))[:, None], np.arange(chosen.shape[1])
+    (r, z, *_), offsets, lines = frame.candidates, frame.candidates.offsets, frame.lines
+    place, first = np.arange(len(r)), np.repeat(offsets[:-1], np.diff(offsets))
 
     def last(marked: BoolArray) -> IntArray:
-        """Place of the last one `marked` before each, -1 if none."""
-        found = np.maximum.accumulate(np.where(marked, place, -1), axis=1)
-        return np.concatenate([np.full((len(found), 1), -1), found[:, :-1]], axis=1)
+        """Place of the last one `marked` before each, in any segment, -1 if none."""
+        found = np.maximum.accumulate(np.where(marked, place, -1))
+        return np.concatenate([[-1], found])[:-1]
 
     before = last(chosen)
-    rise = batch.z - batch.z[own, before]
-    distance = batch.r - batch.r[own, before]
-    walkable = is_walkable(rise, distance, growth.max_slope) & ~batch.in_face & ~batch.above
-    is_open = (before >= 0) & (last(~chosen & ~fitting & ~walkable) < before)
-    line = batch.slope[own, before], batch.extent[own, before]
-    is_shown = carries_on(rise, distance, batch.onward, slope_before(*line, distance, growth))
-    is_shown &= is_open & walkable
-    return is_shown | (is_open & walkable & (rise <= 0.0)), is_shown
+    rise, distance, line = z - z[before], r - r[before], lines.line[before]
+    walkable = is_walkable(rise, distance, growth.max_slope) & ~stops
+    is_open = (before >= first) & (last(~chosen & ~fitting & ~walkable) < before) & walkable
+    extent = r[before] - r[lines.start[line]]
+    slope = slope_before(lines.slope[line], extent, distance, growth)
+    is_shown = is_open & carries_on(rise, distance, frame.onward, slope)
+    return is_shown | (is_open & (rise <= 0.0)), is_shown
 
 
 @shared
@@ -383,45 +326,47 @@ def slope_before(slope: Values, extent: Values, distance: Values, growth: Growth
     return choose(is_long, slope, np.nan)
 
 
-def _rows(batch: _Batch, segment: IntArray, place: IntArray) -> FloatArray:
-    """Prior covariance of places (P,), of segments (P,), with all places, (P, n)."""
-    r, length_scale = batch.r[segment], batch.length_scale[segment]
-    own_r, own_l = batch.r[segment, place][:, None], batch.length_scale[segment, place][:, None]
-    rows: FloatArray = paciorek(own_r, own_l, r, length_scale, batch.sill)
-    rows += line_covariance(own_r, r, *line_variances(batch.observation))
-    return rows
+def _prior_blocks(
+    frame: Frame, u: FloatArray, sill: float, observation: ObservationConfig, step: int
+) -> list[tuple[Padded, FloatArray]]:
+    """Prior of every `step`-th segment by log length-scales `u` (C,), in blocks of S segments.
+
+    A table, (S, n, n + 1), has the covariance of their heights, and then their residuals, which
+    are those given the inliers so far; in single precision.
+    """
+    candidates, blocks = frame.candidates, []
+    z = np.clip(candidates.z - frame.prior_mean, -FARTHEST, FARTHEST)
+    for segments in batches(np.arange(0, candidates.n_segments, step), candidates.offsets):
+        layout = Padded.of(segments, candidates.offsets)
+        columns = (layout.take(values)[:, None] for values in (candidates.r, u, z))
+        r, own_u, residual = (values.astype(np.float32) for values in columns)
+        own_r, l = r.swapaxes(1, 2), np.exp(own_u)  # noqa: E741
+        covariance = paciorek(own_r, l.swapaxes(1, 2), r, l, sill)
+        covariance += line_covariance(own_r, r, *line_variances(observation))
+        blocks.append((layout, np.concatenate([covariance, residual.swapaxes(1, 2)], axis=2)))
+    return blocks
 
 
 def _condition(
-    batch: _Batch,
-    active: IntArray,
-    new: BoolArray,
-    whitened: FloatArray,
-    height: FloatArray,
-    variance: FloatArray,
-) -> FloatArray:
-    """Change height and variance of segments by observing those that are `new`.
+    layout: Padded, table: FloatArray, new: BoolArray, noise: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Change the table of a block by observing those that are `new`, with `noise` (C,).
 
-    Returns their rows, (A, m + n_new, n), behind those `whitened`, (A, m, n).
+    Returns candidates of their segments, (P,), with residual and variance.
     """
+    is_new = new[layout.place] & layout.mask
+    own = np.flatnonzero(is_new.any(axis=1))
     # Places of the new ones, first in each row; the rest is padding.
-    own, segment, n_new = np.arange(len(new))[:, None], active[:, None], new.sum(axis=1)
-    place = np.argsort(~new, axis=1, kind='stable')[:, : n_new.max()]
-    is_new = np.arange(place.shape[1]) < n_new[:, None]
-    which, rank = np.nonzero(is_new)
-    rows = np.zeros((*place.shape, batch.r.shape[1]), batch.r.dtype)
-    rows[which, rank] = _rows(batch, active[which], place[which, rank])
-    if whitened.size:
-        rows -= np.matmul(whitened[own, :, place], whitened)
-    within = rows[own, :, place]
-    add_noise(within, batch.noise[segment, place], is_new)
-    unit = inverse_of_lower(np.linalg.cholesky(within)) * is_new[:, :, None]
-    rows = np.matmul(unit, rows)
-    innovation = batch.z[segment, place] - height[segment, place]
-    innovation = np.matmul(unit, innovation[:, :, None].astype(unit.dtype))
-    height[active] += np.matmul(innovation.swapaxes(1, 2), rows)[:, 0]
-    variance[active] -= np.einsum('sij,sij->sj', rows, rows)
-    return np.concatenate([whitened, rows], axis=1)
+    is_new, n_new = is_new[own], is_new[own].sum(axis=1)[:, None]
+    place, mask = layout.place[own], layout.mask[own]
+    at = np.argsort(~is_new, axis=1, kind='stable')[:, : n_new.max(initial=0)]
+    is_new, observed = np.arange(at.shape[1]) < n_new, np.take_along_axis(place, at, axis=1)
+    rows = table[own[:, None], at]
+    within = add_noise(np.take_along_axis(rows, at[:, None], axis=2), noise[observed], is_new)
+    rows = whitened(within, rows, is_new)
+    given = table[own] - np.matmul(rows[:, :, :-1].swapaxes(1, 2), rows)
+    table[own] = given
+    return place[mask], given[:, :, -1][mask], np.einsum('sii->si', given[:, :, :-1])[mask]
 
 
 def regress(
@@ -452,12 +397,12 @@ def regress(
         within = paciorek(own_r, own_l, own_r.swapaxes(1, 2), own_l.swapaxes(1, 2), sill)
         within += line_covariance(own_r, own_r.swapaxes(1, 2), *line)
         add_noise(within, layout.take(noise), layout.mask)
-        unit = inverse_of_lower(np.linalg.cholesky(within)) * layout.mask[:, :, None]
         rows = paciorek(own_r, own_l, knots, knot_l, sill) + line_covariance(own_r, knots, *line)
-        rows = np.matmul(unit, rows)
-        height = np.matmul(np.matmul(unit, layout.take(z)[:, :, None]).swapaxes(1, 2), rows)[:, 0]
-        variance = prior_variance(sill, observation, knots)
-        variance = variance - np.einsum('sij,sij->sj', rows, rows)
+        rows = whitened(
+            within, np.concatenate([rows, layout.take(z)[:, :, None]], axis=2), layout.mask
+        )
+        rows, own_z = rows[:, :, :-1], rows[:, :, -1:]
+        height = np.matmul(own_z.swapaxes(1, 2), rows)[:, 0]
+        variance = prior_variance(sill, observation, knots) - np.einsum('sij,sij->sj', rows, rows)
         found.mean[own, :n_knots] = np.where(is_wanted, height, np.nan)
-        std = np.sqrt(np.maximum(variance, 0.0))
-        found.std[own, :n_knots] = np.where(is_wanted, std, np.nan)
+        found.std[own, :n_knots] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)

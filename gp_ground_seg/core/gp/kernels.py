@@ -126,16 +126,19 @@ def add_noise(covariance: FloatArray, noise: FloatArray, mask: BoolArray) -> Flo
     return covariance
 
 
-def inverse_of_lower(factors: FloatArray) -> FloatArray:
-    """Inverses of lower triangular matrices (S, n, n).
+def whitened(covariance: FloatArray, rows: FloatArray, mask: BoolArray) -> FloatArray:
+    """Solve ``L X = rows`` for Cholesky factors L of covariances (S, n, n), and rows (S, n, k).
 
-    One by one takes a third of the time of ``np.linalg.inv``, which is for any matrix.
+    X is 0 where there is padding, where `mask` (S, n) is False. Segments are solved one by one:
+    ``np.linalg.solve``, which is for any matrix, takes several times as long.
     """
-    from scipy.linalg.lapack import get_lapack_funcs
+    from scipy.linalg.blas import get_blas_funcs
 
-    # LAPACK takes arrays by columns: our rows are to it the columns of an upper triangle.
-    invert = get_lapack_funcs('trtri', (factors,))
-    return np.array([invert(factor.T)[0].T for factor in factors])
+    solve, result = get_blas_funcs('trsm', (rows,)), rows * mask[:, :, None]
+    for factor, own in zip(np.linalg.cholesky(covariance), result, strict=True):
+        # BLAS takes arrays by columns: to it ours are transposed.
+        own[:] = solve(1.0, factor.T, own.T, side=1, overwrite_b=True).T
+    return result
 
 
 def inverted(covariance: FloatArray) -> tuple[FloatArray, float]:

@@ -59,7 +59,7 @@ def latent_log_length_scales(
     for segments in batches(np.arange(0, candidates.n_segments, step), candidates.offsets):
         layout = Padded.of(segments, candidates.offsets)
         bar = Padded.of(segments, pseudo.offsets)
-        r, r_bar = layout.take(candidates.r)[:, :, None], bar.take(pseudo.r_bar)
+        r_bar, n = bar.take(pseudo.r_bar), layout.mask.shape[1]
         l_bar = bar.take(pseudo.log_extent) + theta[5 + pseudo.kind[bar.place]]
         l_bar = np.where(bar.mask, l_bar, 0.0)
         mean = l_bar.sum(axis=1, keepdims=True) / bar.mask.sum(axis=1, keepdims=True)
@@ -67,14 +67,14 @@ def latent_log_length_scales(
         add_noise(covariance, np.full((1, 1), noise_bar), bar.mask)
         centred = np.where(bar.mask, l_bar - mean, 0.0)
         weight = np.linalg.solve(covariance, centred[:, :, None])
-        cross = squared_exponential(r, r_bar[:, None, :], *kernel)
-        found = np.clip((cross @ weight)[:, :, 0] + mean, -bound, bound)
-        log_length_scale[layout.place[layout.mask]] = found[layout.mask]
         knots = frame.knots[: n_knots[segments].max()]
-        cross = squared_exponential(knots[:, None], r_bar[:, None, :], *kernel)
-        is_wanted = np.arange(len(knots)) < n_knots[segments, None]
+        wanted = np.empty((len(r_bar), n + len(knots), 1))
+        wanted[:, :n, 0], wanted[:, n:, 0] = layout.take(candidates.r), knots
+        cross = squared_exponential(wanted, r_bar[:, None], *kernel)
         found = np.clip((cross @ weight)[:, :, 0] + mean, -bound, bound)
-        knot_log_length_scale[segments, : len(knots)] = np.where(is_wanted, found, np.nan)
+        log_length_scale[layout.place[layout.mask]] = found[:, :n][layout.mask]
+        is_wanted = np.arange(len(knots)) < n_knots[segments, None]
+        knot_log_length_scale[segments, : len(knots)] = np.where(is_wanted, found[:, n:], np.nan)
 
 
 def given_log_length_scales(

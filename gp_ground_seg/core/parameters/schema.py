@@ -222,10 +222,6 @@ class ParameterGroups:
         group_name, field_name = self.find_spec(name).name.split('.')
         return getattr(getattr(self, group_name), field_name)
 
-    def flat(self) -> dict[str, ParameterValue]:
-        """Every value by its dotted name, in order of declaration."""
-        return {name: self[name] for name in self.specs()}
-
     def nested(self) -> dict[str, dict[str, ParameterValue]]:
         """Every value as ``{group: {field: value}}``."""
         return dataclasses.asdict(self)
@@ -404,6 +400,10 @@ def load_yaml(text: str) -> object:
         return yaml.load(text, Loader=_Loader)
     except ConfigError:
         raise
+    except yaml.MarkedYAMLError as error:
+        place = f'line {error.problem_mark.line + 1}' if error.problem_mark else ''
+        said = ', '.join(filter(None, (error.context, error.problem, place)))
+        raise ConfigError(f'not valid YAML: {said}') from error
     except Exception as error:  # of many types: nested too deep, a list as a key, ...
         raise ConfigError(f'not valid YAML: {in_one_line(error)}') from error
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, Values
+from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray, Values
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import SENSOR_HEIGHTS
 from gp_ground_seg.core.pipeline.lowest_points import (
@@ -65,7 +65,7 @@ RESOLUTION = 4096.0
 """Support by a point at `MIDDLE` exactly on a plane; that of each is a whole number, so that sums
 are exact."""
 N_FIRST, N_REFINEMENTS = 2, 13
-"""Steps of `refined` before planes are scored, and of the best one."""
+"""Steps of `refine` before planes are scored, and of the best one."""
 GRAIN = 2.0**-14
 """Planes are rounded to this before they are scored: the backends differ by less, and so score the
 same ones."""
@@ -128,7 +128,7 @@ def find_planes(candidates: Candidates, max_slope: float) -> Iterator[GroundPlan
     (Beaton & Tukey, Technometrics 1974) from the best of them. `max_slope` is that of the
     steepest plane to look for, as rise per metre.
     """
-    loops = Loops(set_hypotheses, best_of, refined)
+    loops = Loops(best_of, refine)
     return planes_of(lowest_points(candidates), max_slope, loops)
 
 
@@ -141,17 +141,15 @@ the recurrence R3, whose steps are powers of the root of x^4 = x + 1 (Roberts, 2
 class Loops(NamedTuple):
     """Loops over the points: those below, or compiled."""
 
-    set_hypotheses: Callable[[LowestPoints, float, FloatArray], int]
     best_of: Callable[[FloatArray, LowestPoints, float], tuple[Plane, float, float]]
-    refined: Callable[[LowestPoints, Plane, float, int], Plane]
+    refine: Callable[[LowestPoints, FloatArray, float, int], None]
 
 
 def planes_of(cells: LowestPoints, max_slope: float, loops: Loops) -> Iterator[GroundPlane]:
     """Yield planes as `find_planes` does; each after the first by the points that are left."""
     if len(cells.z) < MIN_CELLS:
         return
-    planes, left = np.empty((N_LEVEL + N_TRIPLES, 3)), cells
-    planes = planes[: loops.set_hypotheses(cells, max_slope, planes)]
+    planes, left = hypotheses(cells, max_slope, loops), cells
     while True:
         best = loops.best_of(planes, left, 0.0)
         found = described(cells, *own_level(cells, best, max_slope, loops))
@@ -178,8 +176,6 @@ def own_level(
     left = cells._replace(weight=np.where(is_left, cells.weight, 0.0))
     others = other_levels(best, cells, is_left)
     other, score, support = loops.best_of(others, left, OTHER_SHARE * best_score)
-    if score == 0.0:
-        return loops.refined(cells, best, max_slope, N_REFINEMENTS), math.inf
     from_other = np.abs(distance(cells.x, cells.y, cells.z, other))
     whole = left.weight[from_other * cells.inverse <= 1.0].sum()
     if support > TIGHT * RESOLUTION * whole:
@@ -187,31 +183,24 @@ def own_level(
         if other_aside < OWN * aside:
             best, other, d, from_other = other, best, from_other, d
         cells = cells._replace(inverse=np.where(d <= from_other, cells.inverse, 0.0))
-    return loops.refined(cells, best, max_slope, N_REFINEMENTS), other[0]
+    plane = np.array([best])
+    loops.refine(cells, plane, max_slope, N_REFINEMENTS)
+    return (plane[0, 0], plane[0, 1], plane[0, 2]), math.inf if score == 0.0 else other[0]
 
 
-@shared
-def set_hypotheses(cells: LowestPoints, max_slope: float, planes: FloatArray) -> int:
-    """Set planes through three of the points, and level ones through one; return their number.
+def hypotheses(cells: LowestPoints, max_slope: float, loops: Loops) -> FloatArray:
+    """Level planes through one of the points, and refined ones through three, (P, 3).
 
-    They are refined before they are scored: where little ground is seen, no three points of it
-    may be on its plane.
+    Where little ground is seen, no three points of it may be on its plane.
     """
-    n, n_planes = len(cells.z), 0
+    n = len(cells.z)
     n_level = min(n, N_LEVEL)
-    for t in range(n_level + len(SPREAD)):
-        if t < n_level:
-            plane = (-cells.z[t * n // n_level], 0.0, 0.0)
-        else:
-            i, j, k = SPREAD[t - n_level] * n
-            plane = plane_through(cells, int(i), int(j), int(k))
-        if is_possible(plane, max_slope):
-            if t >= n_level:
-                plane = refined(cells, plane, max_slope, N_FIRST)
-            for axis in range(3):
-                planes[n_planes, axis] = math.floor(plane[axis] / GRAIN + 0.5) * GRAIN
-            n_planes += 1
-    return n_planes
+    level = np.multiply.outer(-cells.z[np.arange(n_level) * n // n_level], (1.0, 0.0, 0.0))
+    tilted = planes_through(cells, *(SPREAD * n).astype(np.int64).T)
+    level, tilted = (planes[is_possible(planes.T, max_slope)] for planes in (level, tilted))
+    loops.refine(cells, tilted, max_slope, N_FIRST)
+    planes: FloatArray = np.floor(np.concatenate([level, tilted]) / GRAIN + 0.5) * GRAIN
+    return planes
 
 
 def other_levels(best: Plane, cells: LowestPoints, is_left: BoolArray) -> FloatArray:
@@ -227,24 +216,23 @@ def other_levels(best: Plane, cells: LowestPoints, is_left: BoolArray) -> FloatA
     return np.column_stack([height, np.full((len(height), 2), tilt)])
 
 
-@shared
-def plane_through(cells: LowestPoints, i: int, j: int, k: int) -> Plane:
-    """Plane through three points; infinitely high if they are on a line."""
+def planes_through(cells: LowestPoints, i: IntArray, j: IntArray, k: IntArray) -> FloatArray:
+    """Planes through three points each, (P, 3); NaN if they are on a line."""
     x1, y1, z1 = cells.x[j] - cells.x[i], cells.y[j] - cells.y[i], cells.z[j] - cells.z[i]
     x2, y2, z2 = cells.x[k] - cells.x[i], cells.y[k] - cells.y[i], cells.z[k] - cells.z[i]
     area = x1 * y2 - x2 * y1
-    if area == 0.0:
-        return math.inf, 0.0, 0.0
+    area[area == 0.0] = np.nan
     slope_x, slope_y = (z1 * y2 - z2 * y1) / area, (x1 * z2 - x2 * z1) / area
-    return slope_x * cells.x[i] + slope_y * cells.y[i] - cells.z[i], slope_x, slope_y
+    height = slope_x * cells.x[i] + slope_y * cells.y[i] - cells.z[i]
+    return np.column_stack([height, slope_x, slope_y])
 
 
 @shared
-def is_possible(plane: Plane, max_slope: float) -> bool:
+def is_possible(plane: Any, max_slope: float) -> Any:
     """Whether a plane can be the ground."""
     height, slope_x, slope_y = plane
-    steep = slope_x * slope_x + slope_y * slope_y > max_slope * max_slope
-    return MIN_HEIGHT <= height <= MAX_HEIGHT and not steep
+    is_gentle = slope_x * slope_x + slope_y * slope_y <= max_slope * max_slope
+    return is_gentle & (height >= MIN_HEIGHT) & (height <= MAX_HEIGHT)
 
 
 def asideness(cells: LowestPoints, own: Plane, other: Plane) -> float:
@@ -366,29 +354,22 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     return float(refutation_by(crossing[counts]).sum())
 
 
-@shared
-def refined(cells: LowestPoints, first: Plane, max_slope: float, n_steps: int) -> Plane:
+def refine(cells: LowestPoints, planes: FloatArray, max_slope: float, n_steps: int) -> None:
     """Weighted least squares with Tukey's weights of the plane before, again and again.
 
-    If it drifts off to a plane that cannot be the ground, it is the first.
+    Of `planes`, (P, 3), one that drifts off to a plane that cannot be the ground stays as it is.
     """
-    plane = first
-    for _ in range(n_steps):
-        plane = solve_plane(weighted_moments(cells, plane), plane)
-    return plane if is_possible(plane, max_slope) else first
-
-
-Moments = tuple[float, float, float, float, float, float, float, float, float]
-"""Weighted sums of 1, x, y, x x, x y, y y, z, x z and y z."""
-
-
-def weighted_moments(cells: LowestPoints, plane: Plane) -> Moments:
-    """Return the moments of the points with Tukey's weights."""
     x, y, z = cells.x, cells.y, cells.z
-    weight = tukey_weight(x, y, z, cells.inverse, plane)
-    columns = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y, z, x * z, y * z])
-    w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = (weight * columns).sum(axis=1).tolist()
-    return w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz
+    plane = planes.T
+    for _ in range(n_steps):
+        weight = tukey_weight(x, y, z, cells.inverse, plane[:, :, None])
+        along_x, along_y = weight * x, weight * y
+        flat = weight.sum(axis=1), weight @ x, weight @ y
+        square = along_x @ x, along_x @ y, along_y @ y
+        moments = (*flat, *square, weight @ z, along_x @ z, along_y @ z)
+        plane = np.stack(solve_plane(moments, plane))
+    stays = is_possible(plane, max_slope)
+    planes[stays] = plane.T[stays]
 
 
 @shared
@@ -401,21 +382,25 @@ def tukey_weight(x: Values, y: Values, z: Values, inverse: Values, plane: Plane)
 
 
 @shared
-def solve_plane(moments: Moments, plane: Plane) -> Plane:
-    """Plane of least squares; `plane` where it is not determined."""
+def solve_plane(moments: Any, plane: Any) -> tuple[Values, Values, Values]:
+    """Plane of least squares; `plane` where it is not determined.
+
+    `moments` are the weighted sums of 1, x, y, x x, x y, y y, z, x z and y z.
+    """
     w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = moments
     height, slope_x, slope_y = plane
-    if w <= 0.0:
-        return height, slope_x, slope_y
+    has_points = w > 0.0
+    w = choose(has_points, w, 1.0)
     mx, my, mz = wx / w, wy / w, wz / w
     cxx, cxy, cyy = wxx / w - mx * mx, wxy / w - mx * my, wyy / w - my * my
     cxz, cyz = wxz / w - mx * mz, wyz / w - my * mz
     determinant = cxx * cyy - cxy * cxy
-    if determinant > 1e-3:
-        slope_x = (cxz * cyy - cyz * cxy) / determinant
-        slope_y = (cyz * cxx - cxz * cxy) / determinant
+    is_wide = determinant > 1e-3
+    determinant = choose(is_wide, determinant, 1.0)
+    slope_x = choose(is_wide, (cxz * cyy - cyz * cxy) / determinant, slope_x)
+    slope_y = choose(is_wide, (cyz * cxx - cxz * cxy) / determinant, slope_y)
     # The points may be too close together to determine the slopes, but not the height.
-    return slope_x * mx + slope_y * my - mz, slope_x, slope_y
+    return choose(has_points, slope_x * mx + slope_y * my - mz, height), slope_x, slope_y
 
 
 def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundPlane | None:

@@ -1,6 +1,6 @@
 """Stage 4: lines through the candidates of a segment, and pseudo-inputs on them.
 
-The loops are those of both backends: numba compiles `trace` with all that it calls.
+numba compiles `trace` and its loops; in numpy `_trace_at_once` has none over candidates.
 """
 
 import math
@@ -14,11 +14,12 @@ from gp_ground_seg.core.frame import (
     Candidates,
     Faces,
     FloatArray,
+    IntArray,
     Lines,
     PseudoInputs,
     Values,
 )
-from gp_ground_seg.core.jit import shared
+from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import (
     Config,
     GrowthConfig,
@@ -30,6 +31,10 @@ from gp_ground_seg.core.parameters.schema import numbers_of
 
 UNEVEN = 0.25
 """Distance that is added to that over which the ground rises, as it is not smooth [m]."""
+STEEPEST = 1e150
+"""Slope over which all count as vertical; its square is finite."""
+POINT = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, math.nan
+"""Line of one point, see `with_next`."""
 N_CLASSES = 9
 """Classes of lines that share a length-scale."""
 
@@ -47,39 +52,94 @@ def find_lines(
 
     The lowest point of a face with occluded base is no candidate. Returns the candidates kept,
     lines, pseudo-inputs, how the ground goes on behind each, and which are in faces.
-    `trace_lines` is `trace`, compiled or not.
+    `trace_lines` is `trace`, compiled.
     """
     candidates = candidates.where(~faces.has_occluded_base[candidates.tile])
     n = len(candidates.r)
     lines = Lines(np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64))
-    offsets = np.empty(len(candidates.offsets), np.int64)
-    line, kind = np.empty((2, n), np.int64)
-    pseudo = PseudoInputs(np.empty(n), np.empty(n), offsets, line, kind)
-    onward = np.empty(n)
+    onward, (line, kind) = np.empty(n), np.zeros((2, n), np.int64)
+    pseudo = PseudoInputs(np.empty(n), np.empty(n), candidates.offsets, line, kind)
     groups: Any = tuple(
         map(numbers_of, (config.lines, config.growth, config.latent, config.length_scale))
     )
-    is_break = find_breaks(candidates.r, candidates.density, config.lines)
-    n_lines, n_pseudo = (trace_lines or _trace_lists)(
-        candidates, is_break, groups, lines, pseudo, onward
+    n_lines, n = (trace_lines or _trace_at_once)(
+        candidates, find_starts(candidates, config.lines), groups, lines, pseudo, onward
     )
     lines = Lines(lines.line, lines.slope[:n_lines], lines.start[: n_lines + 1])
-    n = n_pseudo
+    offsets = np.searchsorted(lines.start[line[:n]], candidates.offsets)
     pseudo = PseudoInputs(pseudo.r_bar[:n], pseudo.log_extent[:n], offsets, line[:n], kind[:n])
     if config.learning.length_scale == 'classes':
         pseudo = shared_by_class(lines, pseudo, config.length_scale)
     return candidates, lines, pseudo, onward, faces.is_face[candidates.tile]
 
 
-def _trace_lists(
-    candidates: Candidates, is_break: BoolArray, groups: Groups, *results: Any
+def _trace_at_once(
+    candidates: Candidates,
+    is_start: BoolArray,
+    groups: Groups,
+    lines: Lines,
+    pseudo: PseudoInputs,
+    onward: FloatArray,
 ) -> tuple[int, int]:
-    """Do what `trace` does: plain Python reads lists, and writes views, faster than arrays."""
-    lines, pseudo, onward = results
-    *inputs, breaks = (column.tolist() for column in (*candidates, is_break))
-    views: Any = [memoryview(array) for array in (*lines, *pseudo, onward)]
-    results = Lines(*views[:3]), PseudoInputs(*views[3:8]), views[8]
-    return trace(Candidates(*inputs), breaks, groups, *results)
+    """Do what `trace` does, at once for all segments."""
+    tolerances, growth, latent, limits = groups
+    r, z, offsets = candidates.r, candidates.z, candidates.offsets
+    slope = _line_slopes(r, z, is_start, tolerances)
+    start = np.flatnonzero(is_start)
+    n_lines, size = len(slope), np.diff(start)
+    lines.line[:] = np.repeat(np.arange(n_lines), size)
+    lines.slope[:n_lines], lines.start[: n_lines + 1] = slope, start
+    onward[:] = _onward(r, z, offsets[1:][candidates.segment], growth)
+    number = np.maximum(np.rint(size / latent.candidates_per_pseudo_input).astype(np.int64), 1)
+    line = np.repeat(np.arange(n_lines), number)
+    n, rank = len(line), np.arange(len(line)) - (np.cumsum(number) - number)[line]
+    place = start[line] + place_of(rank, number[line], size[line])
+    extent = np.clip(r[start[1:] - 1] - r[start[:-1]], limits.min, limits.max)
+    pseudo.r_bar[:n], pseudo.log_extent[:n], pseudo.line[:n] = r[place], np.log(extent)[line], line
+    return n_lines, n
+
+
+@np.errstate(over='ignore', invalid='ignore')  # the square of 1e200 m; infinite slopes
+def _line_slopes(
+    r: FloatArray, z: FloatArray, is_start: BoolArray, tolerances: LinesConfig
+) -> FloatArray:
+    """Slope of each line, (Q,); the first candidates of all are set in `is_start` (C + 1,).
+
+    Stretches between those set before, see `find_starts`, grow together, the longest first.
+    """
+    tangent = math.tan(tolerances.slope_tolerance)
+    stretch = np.flatnonzero(is_start)
+    size = np.diff(stretch)
+    order = np.argsort(-size, kind='stable')
+    stretch, size = stretch[order], size[order]
+    first, slope = stretch.copy(), np.full(len(r), np.nan)
+    fresh = np.array(POINT)[:, None]
+    fit = np.repeat(fresh, len(first), axis=1)
+    for step in range(1, size.max(initial=0)):
+        n = np.searchsorted(-size, -step)
+        new, first, fit = stretch[:n] + step, first[:n], fit[:, :n]
+        is_critical, longer = with_next(
+            fit, r[new] - r[first], z[new] - z[first], tolerances, tangent
+        )
+        is_start[new] = is_critical
+        fit, first = np.where(is_critical, fresh, longer), np.where(is_critical, new, first)
+        slope[first] = fit[-1]
+    return slope[is_start[:-1]]
+
+
+def _onward(r: FloatArray, z: FloatArray, stop: IntArray, growth: GrowthConfig) -> FloatArray:
+    """Do what `find_onward` does; `stop` (C,) is where the segment of each candidate ends."""
+    far, r_padded = np.minimum(np.arange(2, len(r) + 2), stop), np.append(r, np.inf)
+    while (is_near := (far < stop) & (r_padded[far] - r < growth.min_rise_extent)).any():
+        far += is_near
+    is_end = np.append(~is_walkable(np.diff(z), np.diff(r), growth.max_slope), True)
+    is_end[stop - 1] = True
+    # The last candidate that walkable steps lead to.
+    end = np.flatnonzero(is_end)[np.cumsum(is_end) - is_end]
+    onward = np.where((far == stop) & (end == stop - 1), np.nan, -np.inf)
+    c = np.flatnonzero(far <= end)
+    onward[c] = slope_behind(z[far[c]] - z[c], r[far[c]] - r[c], growth.max_slope)
+    return onward
 
 
 def class_middles(limits: LengthScaleConfig) -> FloatArray:
@@ -109,19 +169,24 @@ def shared_by_class(lines: Lines, pseudo: PseudoInputs, limits: LengthScaleConfi
     return pseudo._replace(log_extent=class_middles(limits)[kind], kind=kind)
 
 
-def find_breaks(r: FloatArray, density: FloatArray, tolerances: LinesConfig) -> BoolArray:
-    """Whether a gap, or a sharp change of the density, lies before each candidate, (C,)."""
-    breaks, ratio = np.zeros(len(r), np.bool_), tolerances.max_density_ratio
-    breaks[1:] = r[1:] - r[:-1] > tolerances.max_gap + tolerances.max_gap_growth * r[1:]
-    breaks[1:] |= density[1:] > ratio * density[:-1]
-    breaks[1:] |= density[:-1] > ratio * density[1:]
-    return breaks
+def find_starts(candidates: Candidates, tolerances: LinesConfig) -> BoolArray:
+    """Whether a line starts at each candidate, whatever is before, and at the end, (C + 1,).
+
+    It is the first of a segment, or a gap lies before it, or a sharp change of the density.
+    """
+    r, density, ratio = candidates.r, candidates.density, tolerances.max_density_ratio
+    is_start = np.zeros(len(r) + 1, np.bool_)
+    is_start[candidates.offsets] = True
+    is_start[1:-1] |= r[1:] - r[:-1] > tolerances.max_gap + tolerances.max_gap_growth * r[1:]
+    is_denser, is_thinner = density[1:] > ratio * density[:-1], density[:-1] > ratio * density[1:]
+    is_start[1:-1] |= is_denser | is_thinner
+    return is_start
 
 
 @shared
 def trace(
     candidates: Candidates,
-    is_break: BoolArray,
+    is_start: BoolArray,
     groups: Groups,
     lines: Lines,
     pseudo: PseudoInputs,
@@ -129,17 +194,18 @@ def trace(
 ) -> tuple[int, int]:
     """Fill the last three; return the number of lines, and that of pseudo-inputs.
 
-    There is room for as many as there are candidates. For `is_break` see `find_breaks`.
+    There is room for as many as there are candidates; offsets and kinds are not set. For
+    `is_start` see `find_starts`.
     """
     tolerances, growth, latent, limits = groups
-    n_lines = extract_lines(candidates, is_break, tolerances, lines)
+    n_lines = extract_lines(candidates, is_start, tolerances, lines)
     find_onward(candidates, growth, onward)
     return n_lines, select_pseudo_inputs(candidates, lines, n_lines, latent, limits, pseudo)
 
 
 @shared
 def extract_lines(
-    candidates: Candidates, is_break: BoolArray, tolerances: LinesConfig, lines: Lines
+    candidates: Candidates, is_start: BoolArray, tolerances: LinesConfig, lines: Lines
 ) -> int:
     """Cut each segment's candidates into lines; return their number.
 
@@ -148,67 +214,48 @@ def extract_lines(
     distance from the line that is too large, or a sharp change of the vertical density. The next
     line starts there, independent of the one before.
     """
-    r, z, offsets = candidates.r, candidates.z, candidates.offsets
-    tangent = math.tan(tolerances.slope_tolerance)
-    n_lines = 0
-    for m in range(len(offsets) - 1):
-        first, stop = offsets[m], offsets[m + 1]
-        while first < stop:
-            behind, slope = grow_line(first, stop, r, z, is_break, tolerances, tangent)
-            lines.start[n_lines], lines.slope[n_lines] = first, slope
-            for c in range(first, behind):
-                lines.line[c] = n_lines
+    r, z, tangent = candidates.r, candidates.z, math.tan(tolerances.slope_tolerance)
+    fit, first, n_lines = POINT, 0, 0
+    for c in range(len(r)):
+        is_critical, longer = with_next(fit, r[c] - r[first], z[c] - z[first], tolerances, tangent)
+        if is_start[c] or is_critical:
+            lines.start[n_lines], longer, first = c, POINT, c
             n_lines += 1
-            first = behind
+        fit = longer
+        lines.line[c], lines.slope[n_lines - 1] = n_lines - 1, fit[-1]
     lines.start[n_lines] = len(r)
     return n_lines
 
 
 @shared
-def grow_line(
-    first: int,
-    stop: int,
-    r: FloatArray,
-    z: FloatArray,
-    is_break: BoolArray,
-    tolerances: LinesConfig,
-    tangent: float,
-) -> tuple[int, float]:
-    """Candidate behind the line from `first`, at most `stop`, and the line's slope.
+def with_next(
+    fit: Values, dr: Values, dz: Values, tolerances: LinesConfig, tangent: float
+) -> tuple[Values, Values]:
+    """Whether the next point makes a critical point of a line, and the line with it.
 
-    `tangent` is that of ``tolerances.slope_tolerance``.
+    A line is the number of its points, sums over them, and its slope, NaN of one point (see
+    `POINT`). Coordinates relative to its first point, as `dr` and `dz` are, keep their digits.
     """
-    square_distance = tolerances.max_line_distance * tolerances.max_line_distance
-    # Sums relative to the first point of the line keep their digits.
-    sum_r = sum_z = sum_rr = sum_zz = sum_rz = mean_r = mean_z = 0.0
-    slope, n = math.nan, 1
-    for j in range(first + 1, stop):
-        if is_break[j]:
-            return j, slope
-        dr, dz = r[j] - r[first], z[j] - z[first]
-        expected = mean_z + slope * (dr - mean_r)
-        missed = dz - expected
-        if n > 1 and missed * missed > square_distance * (1.0 + slope * slope):
-            return j, slope
-        n += 1
-        sum_r, sum_z = sum_r + dr, sum_z + dz
-        sum_rr, sum_zz, sum_rz = sum_rr + dr * dr, sum_zz + dz * dz, sum_rz + dr * dz
-        mean_r, mean_z = sum_r / n, sum_z / n
-        s_rr, s_zz = sum_rr - n * mean_r * mean_r, sum_zz - n * mean_z * mean_z
-        s_rz = sum_rz - n * mean_r * mean_z
-        new_slope = deming_slope(s_rr, s_zz, s_rz, tolerances.error_ratio)
-        if n > 2:
-            moved = mean_z + new_slope * (dr - mean_r) - expected
-            if abs(moved) > tolerances.offset_tolerance:
-                return j, slope
-            if differs_in_direction(slope, new_slope, tangent):
-                return j, slope
-        slope = new_slope
-    return stop, slope
+    n, sum_r, sum_z, sum_rr, sum_zz, sum_rz, slope = fit
+    expected = sum_z / n + slope * (dr - sum_r / n)
+    missed, distance = dz - expected, tolerances.max_line_distance
+    is_far = missed * missed > distance * distance * (1.0 + slope * slope)
+    n, sum_r, sum_z = n + 1.0, sum_r + dr, sum_z + dz
+    sum_rr, sum_zz, sum_rz = sum_rr + dr * dr, sum_zz + dz * dz, sum_rz + dr * dz
+    mean_r, mean_z = sum_r / n, sum_z / n
+    s_rr, s_zz = sum_rr - sum_r * mean_r, sum_zz - sum_z * mean_z
+    s_rz = sum_rz - sum_r * mean_z
+    new_slope = deming_slope(s_rr, s_zz, s_rz, tolerances.error_ratio)
+    # NaN, which no comparison holds of, where the line is one point.
+    moved = mean_z + new_slope * (dr - mean_r) - expected
+    is_bent = (abs(moved) > tolerances.offset_tolerance) | differs_in_direction(
+        slope, new_slope, tangent
+    )
+    return is_far | is_bent, (n, sum_r, sum_z, sum_rr, sum_zz, sum_rz, new_slope)
 
 
 @shared
-def deming_slope(s_rr: float, s_zz: float, s_rz: float, error_ratio: float) -> float:
+def deming_slope(s_rr: Values, s_zz: Values, s_rz: Values, error_ratio: float) -> Values:
     """Slope dz/dr of the line with errors in both variables: Deming's regression.
 
     The paper's distance-oriented regression (section III-D).
@@ -216,27 +263,26 @@ def deming_slope(s_rr: float, s_zz: float, s_rz: float, error_ratio: float) -> f
     The first three are sums of squares and products about the mean [m^2], `error_ratio` is the
     variance of the height error over that of the range error. Infinite for a vertical line.
     """
-    difference = s_zz - error_ratio * s_rr
-    root = math.sqrt(difference * difference + 4.0 * error_ratio * s_rz * s_rz)
+    difference, twice = s_zz - error_ratio * s_rr, 2.0 * s_rz
+    part = error_ratio * twice
+    larger = abs(difference) + np.sqrt(difference * difference + part * twice)
     # Two equal forms; each is free of cancellation where it is used.
-    if difference > 0.0:
-        numerator, denominator = difference + root, 2.0 * s_rz
-    else:
-        numerator, denominator = 2.0 * error_ratio * s_rz, root - difference
-    if denominator == 0.0:
-        return math.inf if numerator > 0.0 else 0.0
-    return numerator / denominator
+    is_steep = difference > 0.0
+    numerator, denominator = choose(is_steep, larger, part), choose(is_steep, twice, larger)
+    is_vertical = (denominator == 0.0) & is_steep
+    slope = numerator / choose(denominator == 0.0, 1.0, denominator)
+    return choose(is_vertical, math.inf, slope)
 
 
 @shared
-def differs_in_direction(slope: float, new_slope: float, tangent: float) -> bool:
+def differs_in_direction(slope: Values, new_slope: Values, tangent: float) -> Values:
     """Whether lines of these slopes differ in direction by an angle of more than this tangent."""
     # The tangent of the difference of two angles follows from their tangents, which saves
-    # an arctangent for each candidate.
+    # an arctangent for each candidate. Their product is finite.
+    slope = np.minimum(np.maximum(slope, -STEEPEST), STEEPEST)
+    new_slope = np.minimum(np.maximum(new_slope, -STEEPEST), STEEPEST)
     along = 1.0 + slope * new_slope
-    if math.isfinite(along):
-        return along <= 0.0 or abs(new_slope - slope) > tangent * along
-    return abs(math.atan(new_slope) - math.atan(slope)) > math.atan(tangent)
+    return (along <= 0.0) | (abs(new_slope - slope) > tangent * along)
 
 
 @shared
@@ -252,25 +298,24 @@ def select_pseudo_inputs(
 
     Paper, section III-C. Every line gets at least one.
     """
-    r, start = candidates.r, lines.start
-    m = p = 0
+    r, start, p = candidates.r, lines.start, 0
     for q in range(n_lines):
         first, size = start[q], start[q + 1] - start[q]
-        while candidates.offsets[m] <= first:
-            pseudo.offsets[m] = p
-            m += 1
         extent = r[first + size - 1] - r[first]
         log_extent = math.log(min(max(extent, limits.min), limits.max))
         number = max(round(size / latent.candidates_per_pseudo_input), 1)
         for rank in range(number):
-            # The middle of each of `number` equal shares of the line's candidates.
-            pseudo.r_bar[p] = r[first + (size * (2 * rank + 1)) // (2 * number)]
+            pseudo.r_bar[p] = r[first + place_of(rank, number, size)]
             pseudo.log_extent[p] = log_extent
-            pseudo.line[p], pseudo.kind[p] = q, 0
+            pseudo.line[p] = q
             p += 1
-    for k in range(m, len(pseudo.offsets)):
-        pseudo.offsets[k] = p
     return p
+
+
+@shared
+def place_of(rank: Values, number: Values, size: Values) -> Values:
+    """Place of the middle of one of `number` equal shares of the `size` candidates of a line."""
+    return size * (2 * rank + 1) // (2 * number)
 
 
 @shared
@@ -296,10 +341,16 @@ def find_onward(candidates: Candidates, growth: GrowthConfig, onward: FloatArray
             if step == stop <= far:
                 onward[c] = math.nan
             elif far < step:
-                onward[c] = (z[far] - z[c] + growth.max_slope * UNEVEN) / (r[far] - r[c])
+                onward[c] = slope_behind(z[far] - z[c], r[far] - r[c], growth.max_slope)
 
 
 @shared
 def is_walkable(rise: Values, distance: Values, max_slope: Values) -> Values:
     """Whether ground rises or falls by so much over a distance [m]: no more than a slope."""
     return abs(rise) <= max_slope * (distance + UNEVEN)
+
+
+@shared
+def slope_behind(rise: Values, distance: Values, max_slope: Values) -> Values:
+    """Slope with which ground goes on that rises by so much over a distance [m]."""
+    return (rise + max_slope * UNEVEN) / distance

@@ -262,8 +262,8 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
     height of the sensor, for example 0.4 m: far from the last ring on the ground, a gate wider
     than that would accept trunks, persons and cars as ground.
 
-    These are the gates of the growth, the tolerance of ground and the least height of obstacles;
-    nothing for a sensor that is as high as `REFERENCE_HEIGHT`, or that is not seen to be lower.
+    These are the gates of the growth, the drift of slopes, the tolerance of ground and the least
+    height of obstacles; nothing for one as high as `REFERENCE_HEIGHT`, or not seen to be lower.
     """
     share = sensor_height_of(pose) / REFERENCE_HEIGHT
     if share >= 1.0 or config.label.rule != 'roughness':
@@ -274,6 +274,7 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
         'growth.max_std',
         'label.ground_tolerance',
         'label.obstacle_min_height',
+        'observation.slope_drift',
     )
     least = {name: float(find_spec(name).minimum or 0.0) for name in names}
     least['label.ground_tolerance'] = min(LEAST_TOLERANCE, config.label.ground_tolerance)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.frame import IntArray, Label
+from gp_ground_seg.core.frame import Label
 from gp_ground_seg.data.semantic_kitti import GROUND_CLASSES, OUTLIER, UNLABELLED, VEGETATION
 
 Labels = npt.NDArray[np.uint8]
@@ -86,7 +86,10 @@ def count_labels(label: Labels, truth: Labels) -> dict[str, int]:
 
     A given UNKNOWN counts as not ground; where the truth is UNKNOWN the point does not count.
     """
-    (counts,) = _counts(label, truth, np.zeros(len(label), dtype=np.intp), 1)
+    counted = (truth == Label.GROUND) | (truth == Label.OBSTACLE)
+    code = 2 * (label != Label.GROUND) + (truth != Label.GROUND)
+    # In the order of the codes: true and false positives, false and true negatives.
+    counts = np.bincount(code[counted], minlength=len(COUNTS))
     return dict(zip(COUNTS, counts.tolist(), strict=True))
 
 
@@ -97,19 +100,10 @@ def count_rings(
     x, y = points[:, :2].astype(np.float64).T
     reach = np.hypot(x, y)
     ring = np.digitize(reach, RING_EDGES[1:])  # without a finite range: one more
-    counts = _counts(label, truth, ring, len(RING_EDGES)).tolist()
     return [
-        {'range': title, **dict(zip(COUNTS, own, strict=True))}
-        for title, own in zip(RING_TITLES, counts, strict=False)
+        {'range': title, **count_labels(label[ring == k], truth[ring == k])}
+        for k, title in enumerate(RING_TITLES)
     ]
-
-
-def _counts(label: Labels, truth: Labels, group: IntArray, n_groups: int) -> IntArray:
-    """Return `COUNTS` of each group, (n_groups, 4)."""
-    scored = (truth == Label.GROUND) | (truth == Label.OBSTACLE)
-    code = 4 * group + 2 * (label != Label.GROUND) + (truth != Label.GROUND)
-    # In the order of the codes: true and false positives, false and true negatives.
-    return np.bincount(code[scored], minlength=4 * n_groups).reshape(n_groups, 4)
 
 
 def height_sums(

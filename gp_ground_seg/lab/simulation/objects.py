@@ -27,16 +27,11 @@ Kind = IntEnum(
 """What a ray can hit."""
 
 
-# By `Kind`: road, car, building, pole, other structure (an obstacle, which vegetation is not),
-# outlier, vegetation, person, bicyclist.
-_CLASSES = np.array([40, 10, 50, 80, 52, 1, 70, 30, 31], dtype=np.uint32)
+SEMANTIC_KITTI = np.array([40, 10, 50, 80, 52, 1, 70, 30, 31], dtype=np.uint32)
+"""Class in SemanticKITTI of each `Kind`: road, car, building, pole, other structure (an obstacle,
+which vegetation is not), outlier, vegetation, person, bicyclist."""
 REFLECTANCE = np.array([0.25, 0.5, 0.4, 0.6, 0.35, 0.05, 0.3, 0.3, 0.3])
 """Share of the light that each `Kind` sends back."""
-
-
-def semantic_kitti_labels(kind: KindArray) -> npt.NDArray[np.uint32]:
-    """Class in SemanticKITTI of each `Kind` code, (N,) uint32, as ``.label`` files hold them."""
-    return np.asarray(_CLASSES[kind])
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from gp_ground_seg.core.frame import FloatArray
 
@@ -76,13 +75,10 @@ class Profile(Terrain):
         """See `Terrain.along`."""
         axis = self._axis
         u, du = at @ axis, direction @ axis
-        k = self.piece_index(at if piece is None else piece)
+        inside = at if piece is None else piece
+        k = np.searchsorted(self.edges, inside @ axis, side='right')
         v, (c0, c1, c2) = u - self.anchor[k], self.coefficients[k].T
         return Along(c0 + v * (c1 + v * c2), du * (c1 + 2.0 * c2 * v), 2.0 * c2 * du**2)
-
-    def piece_index(self, at: FloatArray) -> npt.NDArray[np.intp]:
-        """Piece in which points (R, 2) lie, (R,)."""
-        return np.searchsorted(self.edges, at @ self._axis, side='right')
 
     def breaks(self) -> FloatArray:
         """Edges of the pieces, (B, 3)."""
@@ -95,7 +91,7 @@ class Profile(Terrain):
 
 @dataclass(frozen=True, eq=False)
 class Waves(Terrain):
-    """Sum of n plane waves A sin(k . (x, y) + phase), times an envelope: >= 0, no parabolas."""
+    """Sum of n plane waves A sin(k . (x, y) + phase), times an envelope: 0 to 1, no parabolas."""
 
     wave_vectors: FloatArray  # (n, 2) k [rad/m]
     amplitudes: FloatArray  # (n,) A [m]
@@ -113,20 +109,12 @@ class Waves(Terrain):
         slope = sum(amplitude * rate * np.cos(angle))
         slope_bound = sum(np.abs(amplitude * rate))
         bend_bound = sum(np.abs(amplitude) * rate**2)
-        index = self.envelope.piece_index(at if piece is None else piece)
+        largest = np.where(factor_slope == 0.0, factor, 1.0)  # of the envelope on the way
         return Along(
             factor * height,
             factor * slope + factor_slope * height,
-            self._largest_factors()[index] * bend_bound + 2.0 * np.abs(factor_slope) * slope_bound,
+            largest * bend_bound + 2.0 * np.abs(factor_slope) * slope_bound,
         )
-
-    def _largest_factors(self) -> FloatArray:
-        """Largest value of the envelope on each piece, at one of its ends, (B + 1,)."""
-        c0, c1, _ = self.envelope.coefficients.T
-        edges, anchor = self.envelope.edges, self.envelope.anchor
-        near = c0 + c1 * (np.concatenate([anchor[:1], edges]) - anchor)
-        far = c0 + c1 * (np.concatenate([edges, anchor[-1:]]) - anchor)
-        return np.asarray(np.maximum(near, far))
 
     def breaks(self) -> FloatArray:
         """Edges of the envelope, (B, 3)."""
