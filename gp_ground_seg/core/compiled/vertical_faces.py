@@ -126,15 +126,22 @@ def _squares_of_blocks(
 ) -> FloatArray:
     """See the plain one; tiles are `lifts` (K,) over the own level [m], NaN of those to leave."""
     n_sides, square, none = int(math.sqrt(len(tiles.at))), np.empty(len(tall)), np.zeros(SUMS)
-    width, block = (n_sides - 1 >> shift) + 1, np.empty(len(tall), np.int64)
-    blocks, raised = np.zeros((width * width, SUMS)), np.flatnonzero(lifts > 0.0)
+    width, raised = (n_sides - 1 >> shift) + 1, np.flatnonzero(lifts > 0.0)
+    number, n = np.full(width * width, OUTSIDE, np.int32), 0
+    blocks, block = np.zeros((len(raised), SUMS)), np.empty(len(tall), np.int32)
     for k in raised:
         column, row = tiles.place[tall[k]] // n_sides, tiles.place[tall[k]] % n_sides
-        block[k] = (column >> shift) * width + (row >> shift)
+        place = (column >> shift) * width + (row >> shift)
+        if number[place] < 0:
+            number[place] = n
+            n += 1
+        block[k] = number[place]
         for i in range(SUMS):
             blocks[block[k], i] += sums[2 * k, i] + sums[2 * k + 1, i]
+    for b in range(n):
+        blocks[b, 0] = slope_square(blocks[b], none)
     for k in raised:
-        square[k] = slope_square(blocks[block[k]], none)
+        square[k] = blocks[block[k], 0]
     return square
 
 

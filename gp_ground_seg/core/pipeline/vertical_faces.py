@@ -62,6 +62,8 @@ to 0.06; what it may be as a multiple of that of the own level, of which this sh
 STEPS, AS_EVEN = 0.05, 1.25
 """Scatter of stairs about their plane [m], of steps of 0.2 m; most that it is over 2 m, as a
 multiple of that over 1 m: of stairs 1.0 to 1.2, of rough banks 1.5."""
+STAIRS_UP = 0.76, 0.94
+"""Vertical components of the normal of what is as steep as stairs: 20 to 41 degrees."""
 SAMPLED = 2
 """One in so many tiles of the own level tells how much it scatters."""
 
@@ -287,7 +289,8 @@ def slope_square(sums: FloatArray, none: FloatArray) -> Values:
     """Do what `scatter_square` does, of returns as steep as stairs; `UNKNOWN` of others."""
     _, xx, yy, zz, xy, xz, yz = moments(sums, none)
     up = normal_z(xx, yy, zz, xy, xz, yz)
-    return choose((up > 0.76) & (up < 0.94), scatter_square(sums, none), UNKNOWN)
+    is_as_steep = (up > STAIRS_UP[0]) & (up < STAIRS_UP[1])
+    return choose(is_as_steep, scatter_square(sums, none), UNKNOWN)
 
 
 @shared
