@@ -75,14 +75,18 @@ def label_points(
     near_tile, sums = _survey(scan, *tables, highest, units, shift, result.height)
     if by_roughness:
         set_roughness(scan.tiles, sums, faces.is_face, units, shift, roughness)
-    bands, tops = np.empty(n_tiles + 1, number), np.full((2, n_tiles + 1), math.inf, number)
+    # Of each tile: the band of ground, and the top of ground in other cells and in flat ones.
+    limits, kind = np.empty((n_tiles + 1, 3), number), np.empty(len(scan.extent), np.int32)
     for t in range(n_tiles + 1):
-        bands[t] = ground_band(roughness[t], highest, config)
+        limits[t, 0] = ground_band(roughness[t], highest, config)
+        limits[t, 1] = limits[t, 2] = math.inf
         if faces.is_face[t]:
             low, is_occluded = np.float64(scan.tiles.extremes[t, 0]), faces.has_occluded_base[t]
-            tops[0, t] = top_of_face(roughness[t], low, is_occluded, config)
-            tops[1, t] = tops[0, t] if is_occluded else math.inf
-    _set_margins(scan, bands, tops, number(depth), config.ground_tolerance, result)
+            limits[t, 1] = top_of_face(roughness[t], low, is_occluded, config)
+            limits[t, 2] = limits[t, 1] if is_occluded else math.inf
+    for c in range(len(kind)):
+        kind[c] = 2 if is_flat(scan.extent[c], config.ground_tolerance) else 1
+    _set_margins(scan, limits.reshape(-1), kind, number(depth), result)
     if by_roughness:
         _vote(scan, near_tile, lowest, config, result.margin)
     for i in range(len(result.label)):
@@ -173,14 +177,15 @@ def _add_squares(
 
 @jit()
 def _set_margins(
-    scan: Scan, bands: PointArray, tops: PointArray, depth: float, tolerance: float, to: Labelled
+    scan: Scan, limits: PointArray, kind: CellArray, depth: float, to: Labelled
 ) -> None:
-    """Set the margins of the points; `bands` and `tops`, also in flat cells, are of tiles."""
-    z, tile, cell, last = scan.xyz[2], scan.tiles.tile, scan.grid.cell, np.int32(len(bands) - 1)
+    """Set the margins of the points; `limits` are three of each tile, `kind` is that of a cell."""
+    z, tile, cell = scan.xyz[2], scan.tiles.tile, scan.grid.cell
+    last, three = np.int32(len(limits) // 3 - 1), np.uintp(3)
     for i in range(len(tile)):
-        t, c = np.uintp(tile[i] if tile[i] >= 0 else last), np.uintp(max(cell[i], np.int32(0)))
-        top = tops[1 if is_flat(scan.extent[c], tolerance) else 0, t]
-        to.margin[i] = margin_of(to.height[i], z[i], bands[t], top, depth)
+        t = three * np.uintp(tile[i] if tile[i] >= 0 else last)
+        top = limits[t + np.uintp(kind[np.uintp(max(cell[i], np.int32(0)))])]
+        to.margin[i] = margin_of(to.height[i], z[i], limits[t], top, depth)
 
 
 @jit()
