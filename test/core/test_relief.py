@@ -92,7 +92,7 @@ def test_the_relief_is_that_of_a_bank(backend, degrees):
     assert (relief.at(np.array([-30.0, 5.0]), np.zeros(2)) == 0.0).all()
 
 
-@pytest.mark.parametrize(('at', 'depth'), [(5.0, 1.2), (7.5, 2.0), (10.0, 3.0)])
+@pytest.mark.parametrize(('at', 'depth'), [(7.5, 2.0), (10.0, 3.0)])
 def test_terrain_ends_at_an_edge_and_goes_on_below(backend, at, depth):
     """What the edge hides is left out: the relief follows the terrain up to it, on both sides."""
     candidates = candidates_on(lambda x, y: np.where(x > at, -depth, 0.0), RINGS)

@@ -95,31 +95,30 @@ def test_backends_find_the_same_faces(compiled_code, seed, dtype):
     assert ours[0].any() or limit == 0.0
 
 
-def patch(y, height, noise, rise=0.0):
-    """Returns on 2 by 2 m from y on, at a height with noise, and steps of a rise along x."""
+def patch(y, height, noise, rise=0.0, apart=0.0):
+    """Returns on 2 by 2 m from y on with noise, and steps along x; in rings so far `apart`."""
     rng = np.random.default_rng(8)
     x, z = rng.uniform(0.0, 2.0, 800), height + rng.normal(0.0, noise, 800)
-    return np.stack([x, rng.uniform(y, y + 2.0, 800), z + rise * np.floor(x / 0.3)], axis=-1)
+    y = rng.uniform(y, y + 2.0, 800)
+    if apart > 0.0:
+        x = (x // apart * apart + 0.3 * y) % 2.0
+    return np.stack([x, y, z + rise * np.floor(x / 0.3)], axis=-1)
 
 
 @pytest.mark.parametrize(
-    ('what', 'shows_none'),
+    ('own', 'what', 'shows_none'),
     [
-        ((0.6, 0.04, 0.0), True),  # a bush
-        ((0.6, 0.01, 0.0), False),  # a bank
-        ((0.6, 0.0, 0.16), True),  # stairs
-        ((0.2, 0.04, 0.0), False),  # tall grass
-        ((-0.6, 0.04, 0.0), False),  # a bed below the own level
+        (0.005, (0.6, 0.04, 0.0, 0.0), True),  # a bush
+        (0.005, (0.6, 0.01, 0.0, 0.0), False),  # a bank
+        (0.005, (0.6, 0.0, 0.16, 0.0), True),  # stairs
+        (0.005, (0.6, 0.0, 0.16, 0.53), True),  # stairs of which a tile shows one step or none
+        (0.005, (0.2, 0.04, 0.0, 0.0), False),  # tall grass
+        (0.005, (-0.6, 0.04, 0.0, 0.0), False),  # a bed below the own level
+        (0.03, (0.6, 0.04, 0.0, 0.0), False),  # land that scatters as the own level does
     ],
 )
-def test_raised_tiles_that_scatter_show_no_ground(backend, what, shows_none):
-    height, noise, rise = what
-    level, raised = patch(0.0, 0.0, 0.005), patch(6.0, height, noise, rise)
+def test_raised_tiles_that_scatter_show_no_ground(backend, own, what, shows_none):
+    level, raised = patch(0.0, 0.0, own), patch(6.0, *what)
     _, is_occluded, _ = faces_of(backend, np.vstack([level, raised]))
     assert not is_occluded[: len(level)].any()
     assert is_occluded[len(level) :].mean() > 0.9 if shows_none else not is_occluded.any()
-
-
-def test_land_may_scatter_as_the_own_level_does(backend):
-    meadow = np.vstack([patch(0.0, 0.0, 0.03), patch(6.0, 0.6, 0.04)])
-    assert not faces_of(backend, meadow)[1].any()

@@ -52,63 +52,20 @@ def find_relief(
 
     `stands` (C,) becomes true of what stands on the ground.
     """
-    before, behind = reachable(candidates, faces, height, growth, stands)
-    terrain, is_known = _fit_planes(candidates, before, height)
-    below, is_known_below = terrain, np.zeros(_N_SQUARES, np.bool_)
-    if behind.any():
-        below, is_known_below = _fit_planes(candidates, behind, height)
-    if max(np.abs(terrain).max(), np.abs(below).max()) <= FADED:
+    reached = reachable(candidates, faces, height, growth, stands)
+    terrain, is_known = _fit_planes(candidates, reached, height)
+    if np.abs(terrain).max() <= FADED:
         return
-    is_behind = np.zeros(_N_SQUARES, np.bool_)
-    if is_known_below.any():
-        is_behind = _behind_of(candidates, before, is_known, behind, is_known_below)
-        _set_pieces(below, is_known_below, is_behind, pieces)
-    _set_pieces(terrain, is_known, ~is_behind, pieces)
-    for c in range(len(z)):
-        u = from_first_middle(candidates.x[c], np.float64)
-        v = from_first_middle(candidates.y[c], np.float64)
-        z[c] = candidates.z[c] - height_in(pieces[np.uintp(u), np.uintp(v)], u, v)
-
-
-@jit()
-def _set_pieces(
-    terrain: FloatArray, is_known: BoolArray, chosen: BoolArray, pieces: FloatArray
-) -> None:
-    """Set the `chosen` ones of the pieces by the terrain, and let it be known all over."""
     _fill(terrain, is_known)
-    for k in range(_N_SQUARES):
-        terrain[k] = faded(terrain[k])
+    high = faded(terrain).reshape(_WIDTH, _WIDTH)[1:-1, 1:-1]
     for i in range(N_SIDES - 1):
         for j in range(N_SIDES - 1):
-            k = _place(i, j)
-            if chosen[k]:
-                corners = terrain[k], terrain[k + _WIDTH], terrain[k + 1], terrain[k + 1 + _WIDTH]
-                pieces[i, j] = piece_of(*corners)
-
-
-@jit()
-def _behind_of(
-    candidates: Candidates,
-    before: BoolArray,
-    is_known: BoolArray,
-    behind: BoolArray,
-    is_known_below: BoolArray,
-) -> BoolArray:
-    """Which pieces are of the terrain behind falls, (squares,). See the plain `_is_behind`."""
-    share, is_seen = np.zeros(_N_SQUARES), np.zeros(_N_SQUARES, np.bool_)
-    for c in range(len(before)):
-        x, y = candidates.x[c], candidates.y[c]
-        square = _place(int(square_of(x)), int(square_of(y)))
-        u, v = from_first_middle(x, np.float64), from_first_middle(y, np.float64)
-        piece = _place(int(u), int(v))
-        if before[c] and is_known[square]:
-            share[piece], is_seen[piece] = 1.0, True
-        elif behind[c] and is_known_below[square]:
-            is_seen[piece] = True
-    # Of those without terrain, all that are as near to terrain before falls get a share of it.
-    _fill(share, is_seen)
-    result: BoolArray = is_seen & (share == 0.0)
-    return result
+            a, b, c, d = high[i, j], high[i + 1, j], high[i, j + 1], high[i + 1, j + 1]
+            pieces[i, j] = piece_of(a, b, c, d)
+    for k in range(len(z)):
+        u = from_first_middle(candidates.x[k], np.float64)
+        v = from_first_middle(candidates.y[k], np.float64)
+        z[k] = candidates.z[k] - height_in(pieces[np.uintp(u), np.uintp(v)], u, v)
 
 
 @jit()

@@ -44,8 +44,8 @@ def reachable(
     height: float,
     growth: GrowthConfig,
     stands: BoolArray,
-) -> tuple[BoolArray, BoolArray]:
-    """See the plain `reachable`, of which the third result is `stands`, to be set."""
+) -> BoolArray:
+    """See the plain `reachable`, of which the second result is `stands`, to be set."""
     r, n = candidates.r, len(candidates.r)
     allowed, is_steep = np.empty(n, np.bool_), np.empty(n, np.bool_)
     marks = np.zeros((4, n), np.bool_)
@@ -71,23 +71,8 @@ def reachable(
         is_near = allowed[c] and r[c] < growth.seed_range
         if is_near and abs(candidates.z[c] + height) < growth.seed_height_tolerance:
             n_seeds[parent[c]] += 1
-    is_terrain &= n_seeds[parent] >= MIN_SEEDS
-    return _sides_of(candidates, is_terrain, walk.is_fallen)
-
-
-@jit()
-def _sides_of(
-    candidates: Candidates, reached: BoolArray, is_fallen: BoolArray
-) -> tuple[BoolArray, BoolArray]:
-    """Candidates that are `reached`: those before falls, and those behind and below one."""
-    offsets, behind = candidates.offsets, np.zeros_like(reached)
-    for m in range(len(offsets) - 1):
-        edge = -np.inf
-        for c in range(offsets[m], offsets[m + 1]):
-            if is_fallen[c] and reached[c]:
-                edge = candidates.z[c - 1]
-            behind[c] = reached[c] and candidates.z[c] < edge - STEEP
-    return reached & ~behind, behind
+    result: BoolArray = is_terrain & (n_seeds[parent] >= MIN_SEEDS)
+    return result
 
 
 @jit()

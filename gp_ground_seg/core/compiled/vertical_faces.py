@@ -12,8 +12,9 @@ from gp_ground_seg.core.compiled.roughness import level_at, levels_about, levels
 from gp_ground_seg.core.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Scan, Tiles
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import FacesConfig, LabelConfig
-from gp_ground_seg.core.pipeline.roughness import N_LEVELS, UNKNOWN, UNKNOWN_LEVEL
+from gp_ground_seg.core.pipeline.roughness import UNKNOWN, UNKNOWN_LEVEL
 from gp_ground_seg.core.pipeline.vertical_faces import (
+    FIRST,
     OWN_SHARE,
     SCATTER,
     SCATTERED,
@@ -28,7 +29,9 @@ from gp_ground_seg.core.pipeline.vertical_faces import (
     is_steep,
     is_vertical,
     scatter_square,
+    slope_square,
     smooth_up_to,
+    vote_on_scatter,
 )
 
 # Each tall tile has two rows, for the lowest returns and for those above: their sums. The first
@@ -52,7 +55,7 @@ def find_faces(
             is_foot = candidates.z[c] - np.float64(tiles.extremes[t, 0]) <= tolerance
             shows_ground[t] |= is_foot and is_flat(scan.extent[cell], tolerance)
     tall, tile_to_row = _select_tall(tiles, height, label)
-    sums = _sum_returns(scan.xyz, tiles, tall, config.cell_size, label, tile_to_row)
+    sums = _sum_returns(scan.xyz, tiles, tall, config.cell_size, height, label, tile_to_row)
     square = np.empty(len(tall))
     for k in range(len(tall)):
         t, low, high = np.uintp(tall[k]), sums[2 * k], sums[2 * k + 1]
@@ -64,7 +67,7 @@ def find_faces(
         is_occluded = is_face and not shows_ground[t] and is_base_occluded(low, high, config)
         faces.has_occluded_base[t] = is_occluded
         square[k] = UNKNOWN if is_face else scatter_square(low, high)
-    _mark_scattered(tiles, tall, square, height, label, faces)
+    _mark_scattered(tiles, tall, sums, square, height, label, faces)
     for m in range(len(candidates.offsets) - 1):
         before = 0.0
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
@@ -78,28 +81,68 @@ def find_faces(
 def _mark_scattered(
     tiles: Tiles,
     tall: CellArray,
+    sums: FloatArray,
     square: FloatArray,
     height: float,
     label: LabelConfig,
     faces: Faces,
 ) -> None:
-    """Mark raised tiles about which many scatter. See the plain `_scattered`."""
-    n, face = len(tall), face_height(label)
-    place, counts = tiles.place[tall], np.zeros(N_LEVELS, np.int64)
-    level, _ = levels_of(square, SQUARE_SCATTERS)
+    """Mark raised tiles about which many scatter. See the plain `vote_on_scatter`."""
+    n, face, lifts = len(tall), face_height(label), np.full(len(tall), np.nan)
+    own = np.full(n, UNKNOWN)
     for k in range(n):
         low, high = tiles.extremes[tall[k], 0], tiles.extremes[tall[k], 1]
         over = np.float64(low) + height
-        if not over > 0.5 * face:
-            if over > -0.5 * face and np.float64(high) - np.float64(low) <= face:
-                counts[level[k]] += level[k] != UNKNOWN_LEVEL
-            level[k] = UNKNOWN_LEVEL
-    limit = smooth_up_to(SCATTER[level_at(counts, counts.sum(), OWN_SHARE)])
-    about = levels_about(place, level, int(math.sqrt(len(tiles.at))), SCATTERED, 0)
+        if faces.is_face[tall[k]]:
+            continue
+        if over > 0.5 * face:
+            lifts[k] = over
+        elif over > -0.5 * face and np.float64(high) - np.float64(low) <= face:
+            own[k] = square[k]
+    limit = _limit_of(own)
+    small = _squares_of_blocks(tiles, tall, sums, lifts, 1)
+    large = _squares_of_blocks(tiles, tall, sums, lifts, 2)
+    level = np.full(n, UNKNOWN_LEVEL, np.int32)
     for k in range(n):
-        over = np.float64(tiles.extremes[tall[k], 0]) + height
-        if level[k] != UNKNOWN_LEVEL and over > face and SCATTER[about[k]] > limit:
+        if lifts[k] > 0.0:
+            level[k] = vote_on_scatter(square[k], small[k], large[k], limit)
+    about = levels_about(tiles.place[tall], level, int(math.sqrt(len(tiles.at))), SCATTERED, 0)
+    for k in range(n):
+        if level[k] != UNKNOWN_LEVEL and about[k] > 0 and lifts[k] > face:
             faces.is_face[tall[k]] = faces.has_occluded_base[tall[k]] = True
+
+
+@jit()
+def _limit_of(square: FloatArray) -> float:
+    """See the plain one."""
+    _, counts = levels_of(square, SQUARE_SCATTERS)
+    limit: float = smooth_up_to(SCATTER[level_at(counts, counts.sum(), OWN_SHARE)])
+    return limit
+
+
+@jit()
+def _squares_of_blocks(
+    tiles: Tiles, tall: CellArray, sums: FloatArray, lifts: FloatArray, shift: int
+) -> FloatArray:
+    """See the plain one; tiles are `lifts` (K,) over the own level [m], NaN of those to leave."""
+    n_sides, square, none = int(math.sqrt(len(tiles.at))), np.empty(len(tall)), np.zeros(SUMS)
+    width, raised = (n_sides - 1 >> shift) + 1, np.flatnonzero(lifts > 0.0)
+    number, n = np.full(width * width, OUTSIDE, np.int32), 0
+    blocks, block = np.zeros((len(raised), SUMS)), np.empty(len(tall), np.int32)
+    for k in raised:
+        column, row = tiles.place[tall[k]] // n_sides, tiles.place[tall[k]] % n_sides
+        place = (column >> shift) * width + (row >> shift)
+        if number[place] < 0:
+            number[place] = n
+            n += 1
+        block[k] = number[place]
+        for i in range(SUMS):
+            blocks[block[k], i] += sums[2 * k, i] + sums[2 * k + 1, i]
+    for b in range(n):
+        blocks[b, 0] = slope_square(blocks[b], none)
+    for k in raised:
+        square[k] = blocks[block[k], 0]
+    return square
 
 
 @jit()
@@ -121,6 +164,7 @@ def _sum_returns(
     tiles: Tiles,
     tall: CellArray,
     tile_size: float,
+    height: float,
     label: LabelConfig,
     tile_to_row: CellArray,
 ) -> FloatArray:
@@ -129,9 +173,9 @@ def _sum_returns(
     half = 0.5 * n_sides * tile_size
     for k in range(len(tall)):
         place = tiles.place[tall[k]]
-        # About a point of the tile: about the sensor, rounding would exceed the scatter.
-        sums[2 * k, _X] = in_units((place // n_sides) * tile_size - half)
-        sums[2 * k, _Y] = in_units((place % n_sides) * tile_size - half)
+        # About a point near the tile: about the sensor, rounding would exceed the scatter.
+        sums[2 * k, _X] = in_units((place // n_sides & FIRST) * tile_size - half)
+        sums[2 * k, _Y] = in_units((place % n_sides & FIRST) * tile_size - half)
         sums[2 * k, _BASE] = tiles.extremes[tall[k], 0]
     foot_height, max_height = label.ground_tolerance, label.obstacle_max_height
     x, y, z, tile = columns[0], columns[1], columns[2], tiles.tile
@@ -146,7 +190,7 @@ def _sum_returns(
         if above > max_height:
             continue
         dx, dy = in_units(np.float64(x[i]) - low[_X]), in_units(np.float64(y[i]) - low[_Y])
-        dz = in_units(above)
+        dz = in_units(np.float64(z[i]) + height)
         # No branch: whether a return is one of the lowest is unpredictable.
         s = sums[np.uintp(k + np.int32(above > foot_height))]
         s[0] += 1.0

@@ -21,7 +21,6 @@ from gp_ground_seg.core.frame import (
     FloatArray,
     PointArray,
     Values,
-    as_index,
 )
 from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import Config
@@ -86,41 +85,19 @@ def find_relief(
 ) -> tuple[Relief, Candidates, Faces]:
     """Relief over a plane `height` [m] below the origin, and the candidates over the relief.
 
-    What is behind a fall has a relief of its own, so that the relief before it is flat up to the
-    edge. The third is `faces` with what stands on the ground.
+    The third is `faces` with what stands on the ground.
     """
     if not config.surface.look_aside:
         return Relief.level(), candidates, faces
-    *reached, stands = reachable(candidates, faces, height, config.growth)
+    is_reached, stands = reachable(candidates, faces, height, config.growth)
     faces = with_standing(faces, candidates.tile, stands)
-    sides = [candidates._replace(z=candidates.z + height).where(side) for side in reached]
-    terrains = [fit_planes(side.x, side.y, side.z) for side in sides if len(side.r)]
-    if not any((np.abs(terrain[is_known]) > FADED).any() for terrain, is_known in terrains):
+    reached = candidates.where(is_reached)
+    terrain, is_known = fit_planes(reached.x, reached.y, reached.z + height)
+    if not (np.abs(terrain[is_known]) > FADED).any():
         return Relief.level(), candidates, faces
-    relief = Relief.of(faded(filled(*terrains[0])))
-    if len(terrains) == 2 and terrains[1][1].any():
-        behind = Relief.of(faded(filled(*terrains[1])))
-        is_behind = _is_behind(sides, terrains)[..., None]
-        relief = Relief(np.where(is_behind, behind.pieces, relief.pieces))
+    relief = Relief.of(faded(filled(terrain, is_known)))
     z = candidates.z - relief.at(candidates.x, candidates.y)
     return relief, candidates._replace(z=z), faces
-
-
-def _is_behind(sides: list[Candidates], terrains: list[tuple[FloatArray, BoolArray]]) -> BoolArray:
-    """Which pieces of the relief are nearer to terrain behind falls than to terrain before them.
-
-    As a mask, (N_SIDES - 1, N_SIDES - 1). Pieces with terrain of both are of that before.
-    """
-    share = np.zeros((N_SIDES - 1, N_SIDES - 1))
-    is_seen = np.zeros(share.shape, dtype=np.bool_)
-    for is_before, side, (_, is_known) in zip((1.0, 0.0), sides, terrains, strict=True):
-        known = is_known[as_index(square_of(side.x)), as_index(square_of(side.y))]
-        u, v = (as_index(from_first_middle(p[known], np.float64)) for p in (side.x, side.y))
-        share[u, v] += is_before
-        is_seen[u, v] = True
-    # Of those without terrain, all that are as near to terrain before falls get a share of it.
-    result: BoolArray = is_seen.any() & (filled(share, is_seen) == 0.0)
-    return result
 
 
 def fit_planes(x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, BoolArray]:

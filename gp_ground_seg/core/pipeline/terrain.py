@@ -52,7 +52,7 @@ MIN_FALL = math.sqrt(2.0) * SQUARE
 
 def reachable(
     candidates: Candidates, faces: Faces, height: float, growth: GrowthConfig
-) -> tuple[BoolArray, BoolArray, BoolArray]:
+) -> tuple[BoolArray, BoolArray]:
     """Which of the candidates can be reached from enough seeds near the sensor, on foot.
 
     Vertical faces are no terrain. Gentle steps are taken anywhere, steep and long ones only in a
@@ -61,8 +61,7 @@ def reachable(
     only between terrain: what is seen over a hedge is below its top. The plane near the sensor is
     `height` [m] below the origin.
 
-    Returns those before falls in their segment, those behind and below one, and those that stand
-    on the ground, see `_entered`, three (C,): across a ditch the terrain is that before it.
+    Returns those, and those that stand on the ground, see `_entered`, two (C,).
     """
     candidates = candidates._replace(z=candidates.z + height)
     allowed = ~faces.is_face[candidates.tile] & (candidates.r < REACH)
@@ -84,15 +83,7 @@ def reachable(
     taken &= ~is_fall | (is_terrain[first] & is_terrain[second])
     group = _groups(len(allowed), first[taken], second[taken])
     is_reached = (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
-    is_fallen = np.zeros(len(allowed), dtype=np.bool_)
-    is_fallen[second[taken & is_fall]] = True
-    is_fallen &= is_reached
-    number = np.cumsum(is_fallen)
-    edge = np.append(0, np.flatnonzero(is_fallen))[number] - 1
-    is_behind = number > np.append(0, number)[candidates.offsets][candidates.segment]
-    is_behind &= candidates.z < candidates.z[edge] - STEEP
-    is_reached &= is_terrain
-    return is_reached & ~is_behind, is_reached & is_behind, stands
+    return is_reached & is_terrain, stands
 
 
 def _entered(

@@ -42,9 +42,11 @@ MIN_RETURNS = 4
 FLATNESS = 1e-9
 """Scatter across a line, in parts of that along it, or of each return [m^2], which is none: as
 wide as coordinates are rounded to. What is left is rounding, and has no orientation."""
+FIRST = ~3
+"""Mask of the column and row of a tile: those of the first in its block of four by four."""
 UNITS_PER_METRE = 2.0**16
-"""Coordinates are rounded to units of 15 um: squares and products within a tile, and sums of two
-hundred thousand of them, are then exact, so that their order does not matter."""
+"""Coordinates are rounded to units of 15 um: squares and products within a block of tiles, and
+sums of two thousand of them, are exact up to 30 m over the own level: no order matters."""
 MIN_WIDTH = 0.05
 """Least standard deviation of the returns of a tile, in all directions but one, of which the
 scatter about their plane is known [m]: more than that of one ring by noise of its ranges."""
@@ -54,9 +56,14 @@ SQUARE_SCATTERS = SQUARE_EDGES / 16.0
 between them [m, m^2]."""
 SCATTERED = Window(2, 0.75, 4)
 """Window of the raised tiles among which many may scatter: of 6 m, for tiles of 0.5 m."""
-SMOOTH, TIMES_OWN, OWN_SHARE = 0.025, 4.5, 0.75
+SMOOTH, TIMES_OWN, OWN_SHARE = 0.0265, 4.5, 0.75
 """Scatter up to which terrain is smooth [m]: that of KITTI has 0.003 to 0.02, beds and stairs 0.03
 to 0.06; what it may be as a multiple of that of the own level, of which this share is smoother."""
+STEPS, AS_EVEN = 0.05, 1.25
+"""Scatter of stairs about their plane [m], of steps of 0.2 m; most that it is over 2 m, as a
+multiple of that over 1 m: of stairs 1.0 to 1.2, of rough banks 1.5."""
+STAIRS_UP = 0.76, 0.94
+"""Vertical components of the normal of what is as steep as stairs: 20 to 41 degrees."""
 SAMPLED = 2
 """One in so many tiles of the own level tells how much it scatters."""
 
@@ -86,24 +93,24 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     above = scan.xyz[used, 2].astype(np.float64) - lowest_z[row[used]]
     low = np.flatnonzero(above <= label.obstacle_max_height)
     used, above = used[low], above[low]
-    row = row[used]
-    # Relative to a point of the tile: about the sensor, rounding would exceed the scatter.
+    row, z = row[used], scan.xyz[used, 2].astype(np.float64) + height
+    # Relative to a point near the tile: about the sensor, rounding would exceed the scatter.
     x, y = (
         scan.xyz[used, i]
-        - in_units(place * faces.cell_size - 0.5 * n_sides * faces.cell_size)[row]
+        - in_units((place & FIRST) * faces.cell_size - 0.5 * n_sides * faces.cell_size)[row]
         for i, place in enumerate(np.divmod(tiles.place[tall], n_sides))
     )
     # Rows of the foot first, then those of the rest.
     is_rest = above > label.ground_tolerance
-    sums = _sums(x, y, above, row + len(tall) * is_rest, 2 * len(tall))
+    sums = _sums(x, y, z, row + len(tall) * is_rest, 2 * len(tall))
     foot, rest = sums[:, : len(tall)], sums[:, len(tall) :]
     reaches = extent > face_height(label)
     result.is_face[tall] = reaches & is_vertical(foot, rest, faces)
     result.is_steep[tall] = reaches & is_steep(rest)
     result.has_occluded_base[tall] = result.is_face[tall] & is_base_occluded(foot, rest, faces)
     result.has_occluded_base[_with_flat_foot(scan, label.ground_tolerance)] = False
-    square = np.where(result.is_face[tall], UNKNOWN, scatter_square(foot, rest))
-    rough = tall[_scattered(tiles.place[tall], n_sides, square, extent, over, label)]
+    is_face, place = result.is_face[tall], tiles.place[tall]
+    rough = tall[_scattered(place, n_sides, foot + rest, is_face, extent, over, label)]
     result.is_face[rough] = result.has_occluded_base[rough] = True
     candidates = scan.candidates
     is_next = np.diff(candidates.segment, prepend=-1) == 0
@@ -126,24 +133,45 @@ def _with_flat_foot(scan: Scan, tolerance: float) -> CellArray:
 def _scattered(
     place: CellArray,
     n_sides: int,
-    square: FloatArray,
+    sums: FloatArray,
+    is_face: BoolArray,
     extent: FloatArray,
     over: FloatArray,
     label: LabelConfig,
-) -> BoolArray:
-    """Which tiles at a `place` (K,) are raised, with many about them that scatter, (K,).
+) -> IntArray:
+    """List the tiles, of those at a `place` (K,), that are raised, and among many that scatter.
 
-    `square` (K,) is that of their scatter, or `UNKNOWN`; for the others see `is_examined`.
+    `sums`, (SUMS, K), are over their returns; for the others see `is_examined`.
     """
-    is_known, face = square != UNKNOWN, face_height(label)
-    level = np.searchsorted(SQUARE_SCATTERS, square, side='right')
-    is_own = is_known & (np.abs(over) < 0.5 * face) & (extent <= face)
-    counts = np.bincount(level[is_own], minlength=N_LEVELS)
-    own = SCATTER[level_at(counts[None, :], OWN_SHARE)[0]]
-    level[~(is_known & (over > 0.5 * face))] = UNKNOWN_LEVEL
-    about = SCATTER[levels_about(place, level, n_sides, SCATTERED, 0)]
-    result: BoolArray = (level != UNKNOWN_LEVEL) & (over > face) & (about > smooth_up_to(own))
+    square, face = scatter_square(sums, np.zeros_like(sums)), face_height(label)
+    is_own = ~is_face & (np.abs(over) < 0.5 * face) & (extent <= face)
+    limit = _limit_of(square[is_own])
+    raised = np.flatnonzero(~is_face & (over > 0.5 * face))
+    place = place[raised]
+    small, large = (_squares_of_blocks(place, n_sides, sums[:, raised], n) for n in (1, 2))
+    vote = vote_on_scatter(square[raised], small, large, limit)
+    about = levels_about(place, vote, n_sides, SCATTERED, 0)
+    result: IntArray = raised[(vote != UNKNOWN_LEVEL) & (about > 0) & (over[raised] > face)]
     return result
+
+
+def _limit_of(square: FloatArray) -> float:
+    """Largest scatter of smooth terrain, by squares of those of the own level, (K,) [m]."""
+    level = np.searchsorted(SQUARE_SCATTERS, square[square != UNKNOWN], side='right')
+    counts = np.bincount(level, minlength=N_LEVELS)[None, :]
+    return float(smooth_up_to(SCATTER[level_at(counts, OWN_SHARE)[0]]))
+
+
+def _squares_of_blocks(place: CellArray, n_sides: int, sums: FloatArray, shift: int) -> FloatArray:
+    """Square of the scatter in the block of 2^shift tiles a side that each is in, (K,) [m^2].
+
+    `sums` over the returns of tiles at a `place` (K,) are about one point in each block.
+    """
+    column, row = np.divmod(as_index(place), n_sides)
+    block = (column >> shift) * n_sides + (row >> shift)
+    blocks = np.array([np.bincount(block, total)[block] for total in sums])
+    square: FloatArray = slope_square(blocks, np.zeros_like(blocks))
+    return square
 
 
 @shared
@@ -254,6 +282,28 @@ def scatter_square(foot: FloatArray, rest: FloatArray) -> Values:
     is_known = is_wide & (n >= MIN_RETURNS)
     square = np.maximum(determinant, 0.0) / (n * choose(is_known, minors, 1.0))
     return choose(is_known, square, UNKNOWN)
+
+
+@shared
+def slope_square(sums: FloatArray, none: FloatArray) -> Values:
+    """Do what `scatter_square` does, of returns as steep as stairs; `UNKNOWN` of others."""
+    _, xx, yy, zz, xy, xz, yz = moments(sums, none)
+    up = normal_z(xx, yy, zz, xy, xz, yz)
+    is_as_steep = (up > STAIRS_UP[0]) & (up < STAIRS_UP[1])
+    return choose(is_as_steep, scatter_square(sums, none), UNKNOWN)
+
+
+@shared
+def vote_on_scatter(square: Values, small: Values, large: Values, limit: float) -> Values:
+    """Whether a raised tile scatters more than terrain: 1, or 0, or `UNKNOWN_LEVEL`.
+
+    Squares of the scatter are of the tile, and of blocks of 1 and 2 m [m^2]. A tile of stairs may
+    show one step alone, but a block scatters as much as one twice as large: both lie on one plane.
+    """
+    even = np.minimum(STEPS * STEPS, AS_EVEN * AS_EVEN * small)
+    is_stepped = (small > SMOOTH * SMOOTH) & (large > 0.0) & (large < even)
+    is_smooth = (square != UNKNOWN) | ((small != UNKNOWN) & (small <= SMOOTH * SMOOTH))
+    return choose(is_stepped | (square > limit * limit), 1, choose(is_smooth, 0, UNKNOWN_LEVEL))
 
 
 @shared
