@@ -92,8 +92,8 @@ def test_the_relief_is_that_of_a_bank(backend, degrees):
     assert (relief.at(np.array([-30.0, 5.0]), np.zeros(2)) == 0.0).all()
 
 
-@pytest.mark.parametrize(('at', 'depth'), [(7.5, 2.0), (10.0, 3.0)])
-def test_terrain_ends_at_an_edge_and_goes_on_below(backend, at, depth):
+@pytest.mark.parametrize(('at', 'depth', 'share'), [(5, 1.2, 0.95), (7.5, 2, 1), (10, 3, 1)])
+def test_terrain_ends_at_an_edge_and_goes_on_below(backend, at, depth, share):
     """What the edge hides is left out: the relief follows the terrain up to it, on both sides."""
     candidates = candidates_on(lambda x, y: np.where(x > at, -depth, 0.0), RINGS)
     seen = at * (HEIGHT + depth) / HEIGHT
@@ -101,8 +101,9 @@ def test_terrain_ends_at_an_edge_and_goes_on_below(backend, at, depth):
     _, over, _ = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
     is_below = candidates.x > seen
     assert is_below.sum() > 150
-    np.testing.assert_allclose(over.z[~is_below] + HEIGHT, 0.0, atol=0.01)
-    np.testing.assert_allclose(over.z[is_below] + HEIGHT, 0.0, atol=0.05)
+    off = np.abs(over.z + HEIGHT)
+    assert off[~is_below].max() < 0.01
+    assert np.mean(off[is_below] < 0.05) >= share and off[is_below].max() < 0.2
 
 
 def box(x0, x1, y0, y1, high):
