@@ -13,7 +13,7 @@ import pytest
 from conftest import find_kitti
 
 from gp_ground_seg import Config, GroundSegmenter, Segmentation
-from gp_ground_seg.data.semantic_kitti import read_points
+from gp_ground_seg.data.cloud_files import read_file
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -31,7 +31,7 @@ def segmented(folder: Path, **changes: object) -> Iterator[tuple[str, Segmentati
     """Name and result of each frame."""
     segmenter = GroundSegmenter(Config().replace(**changes))
     for path in sorted(folder.glob('sequences/*/velodyne/*.bin')):
-        yield f'{path.parts[-3]}/{path.stem}', segmenter.segment(read_points(path))
+        yield f'{path.parts[-3]}/{path.stem}', segmenter.segment(read_file(path).xyz)
 
 
 def summaries(folder: Path, **changes: object) -> dict[str, dict]:

@@ -17,7 +17,7 @@ from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.jit import JIT_ENABLED
 from gp_ground_seg.core.pipeline.points import angles_of, rotate, rotation
 from gp_ground_seg.core.pipeline.sensor_pose import CLEAR_TILT, DEFAULT_HEIGHT
-from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
+from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences
 from gp_ground_seg.lab import simulation
 from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, SCENES, VLP_16
 
@@ -343,7 +343,7 @@ def test_real_frames(kitti, first):
     """The sensor is 1.73 m high; camber and verges move the plane by less than 0.15 m."""
     for sequence, (up, angles) in zip(list_sequences(kitti), cycle(UPS.items()), strict=False):
         for frame in list_frames(kitti, sequence)[first::6]:
-            points = read_points(frame.points_path)
+            points = frame.points
             pose = pose_of(points)
             assert pose.height_estimated
             assert pose.height == pytest.approx(1.73, abs=0.15), frame
