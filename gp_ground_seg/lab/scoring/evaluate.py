@@ -42,7 +42,7 @@ Mount = tuple[float | None, Sequence[float]]
 
 ALL = 'all'
 KEYS = ('method', 'sequence', 'index')
-"""Columns of every frame. Rows are in the order of the scans, those of a scan of the methods."""
+"""Columns of every frame. Method and sequence are in the order of the methods and the scans."""
 COLUMNS: dict[str, tuple[str, ...]] = {
     'scans': KEYS,
     'rings': (*KEYS, 'range', *COUNTS),
@@ -287,9 +287,12 @@ class Scores(NamedTuple):
 
 
 def make_scores(parts: Iterable[Rows]) -> Scores:
-    """Make frames of rows."""
+    """Make frames of rows, in the order of the methods."""
     parts = [*parts]
     rows = {name: [row for part in parts for row in part.get(name, ())] for name in COLUMNS}
+    methods = list(dict.fromkeys(row['method'] for row in rows['scans']))
+    for own in rows.values():
+        own.sort(key=lambda row: methods.index(row['method']))
     return Scores(*(frame_of(own, COLUMNS[name]) for name, own in rows.items()))
 
 
