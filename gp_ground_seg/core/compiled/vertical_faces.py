@@ -116,8 +116,7 @@ def _mark_scattered(
 def _limit_of(square: FloatArray) -> float:
     """See the plain one."""
     _, counts = levels_of(square, SQUARE_SCATTERS)
-    limit: float = smooth_up_to(SCATTER[level_at(counts, counts.sum(), OWN_SHARE)])
-    return limit
+    return float(smooth_up_to(SCATTER[level_at(counts, counts.sum(), OWN_SHARE)]))
 
 
 @jit()

@@ -193,14 +193,12 @@ def hypotheses(cells: LowestPoints, max_slope: float, loops: Loops) -> FloatArra
 
     Where little ground is seen, no three points of it may be on its plane.
     """
-    n = len(cells.z)
-    n_level = min(n, N_LEVEL)
+    n, n_level = len(cells.z), min(len(cells.z), N_LEVEL)
     level = np.multiply.outer(-cells.z[np.arange(n_level) * n // n_level], (1.0, 0.0, 0.0))
     tilted = planes_through(cells, *(SPREAD * n).astype(np.int64).T)
     level, tilted = (planes[is_possible(planes.T, max_slope)] for planes in (level, tilted))
     loops.refine(cells, tilted, max_slope, N_FIRST)
-    planes: FloatArray = np.floor(np.concatenate([level, tilted]) / GRAIN + 0.5) * GRAIN
-    return planes
+    return np.asarray(np.floor(np.concatenate([level, tilted]) / GRAIN + 0.5) * GRAIN)
 
 
 def other_levels(best: Plane, cells: LowestPoints, is_left: BoolArray) -> FloatArray:

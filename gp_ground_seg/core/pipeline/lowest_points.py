@@ -88,5 +88,5 @@ def nearness(r: Values) -> Values:
 
 def is_new(sector: IntArray) -> BoolArray:
     """Which cells are the nearest of a sector: they come sector by sector, from near to far."""
-    result: BoolArray = np.diff(sector, prepend=-1) != 0
+    result: BoolArray = sector != np.append(-1, sector[:-1])
     return result
