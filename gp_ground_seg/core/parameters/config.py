@@ -175,7 +175,7 @@ class ObservationConfig(ParameterGroup):
         'standard deviation of the height noise of a ground candidate', 'm', 'sigma_n')
     slope_std: float = advanced(0.05, (0.0, 2.0),
         "prior standard deviation of the mean line's slope; 0 = a level mean")
-    slope_drift: float = advanced(0.005, (0.0, 1.0),
+    slope_drift: float = advanced(0.003, (0.0, 1.0),
         "standard deviation that the mean line's slope gains over a metre, and over others with "
         'the square root of the distance; less for a sensor below 1 m; 0 = a straight line')
 
