@@ -18,8 +18,8 @@ FARTHEST = 1e4
 """Range beyond which no sensor measures [m]."""
 ENOUGH_POINTS = 20000
 """Points that show well enough which way is up."""
-LARGEST = {4: 1e38, 8: 1e300}
-"""By bytes: coordinates beyond this are taken to be this [m]: sums of three still are numbers."""
+LARGEST = 1e38
+"""Coordinates beyond this are taken to be this [m]: sums of three fit single precision."""
 SINGLE = 2.0**-23
 """Rounding of single precision, in parts of a number."""
 _MAX_BEYOND = 0.1  # share of the points that may lie there, as wrong returns
@@ -219,8 +219,7 @@ def rotate(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
     Finite ones stay finite, others become NaN. It is computed in double precision; rounded to
     single, a point 100 m away moves by 4 um.
     """
-    largest = LARGEST[xyz.dtype.itemsize]
-    x, y, z = np.clip(xyz, -largest, largest).T.astype(np.float64)
+    x, y, z = np.clip(xyz, -LARGEST, LARGEST).T.astype(np.float64)
     columns = np.empty((3, len(xyz)), dtype=xyz.dtype)
     with np.errstate(invalid='ignore'):
         # Not a matrix product: BLAS would wake its threads, which spin long after.

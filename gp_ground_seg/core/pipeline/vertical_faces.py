@@ -25,6 +25,7 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, FacesConfig, LabelConfig
+from gp_ground_seg.core.pipeline.points import FARTHEST
 from gp_ground_seg.core.pipeline.roughness import (
     N_LEVELS,
     ROUGHNESS,
@@ -185,11 +186,12 @@ def is_examined(extent: Values, over: Values, place: Values, label: LabelConfig)
     """Whether the scatter of a tile matters.
 
     Its highest return is `extent` above the lowest, and that is `over` the own level [m]: it is
-    tall, or raised, or tells with others how much the own level scatters.
+    tall, or raised, or tells with others how much the own level scatters. Nothing is measured
+    beyond `FARTHEST`: squares there may exceed all numbers.
     """
     face = face_height(label)
     is_sample = (place % SAMPLED == 0) & (over > -0.5 * face)
-    return (extent > face) | (over > 0.5 * face) | is_sample
+    return ((extent > face) | (over > 0.5 * face) | is_sample) & (np.abs(over) < FARTHEST)
 
 
 @shared
@@ -278,8 +280,7 @@ def scatter_square(foot: FloatArray, rest: FloatArray) -> Values:
     a, b, c = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
     minors = a + b + c
     determinant = xx * a - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    is_wide = minors > n * MIN_WIDTH * MIN_WIDTH * (xx + yy + zz)
-    is_known = is_wide & (n >= MIN_RETURNS)
+    is_known = (n >= MIN_RETURNS) & (minors > n * MIN_WIDTH * MIN_WIDTH * (xx + yy + zz))
     square = np.maximum(determinant, 0.0) / (n * choose(is_known, minors, 1.0))
     return choose(is_known, square, UNKNOWN)
 
