@@ -1,14 +1,13 @@
 """Latency and losses of the node: ``python test/node_bench.py [ROOT]``, on an idle machine.
 
 The node runs in a second process and is sent clouds through ROS at several rates, in a namespace
-of a random name: frames of a KITTI_ROOT, or simulated scans of a sensor. What follows
-``--ros-args`` goes to the node.
+of a random name: frames of a KITTI_ROOT, or simulated scans of a sensor. Its CPU time is beside
+that of a call of Patchwork++ at the same rate. For its first minute, set NUMBA_CACHE_DIR to an
+empty folder; for a starved node, use taskset, and busy loops.
 """
 
 import argparse
 import itertools
-import os
-import sys
 import tempfile
 import time
 from functools import partial
@@ -16,33 +15,25 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from cli_runner import cpu_seconds
 
 from gp_ground_seg.cli.demo import FRAME_ID
 from gp_ground_seg.cli.options import progress
 from gp_ground_seg.data.bags import cloud_from_points, decode_cloud, encode_cloud, with_stamp
 from gp_ground_seg.data.point_cloud2 import stamp_of
 from gp_ground_seg.data.semantic_kitti import frames
+from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import describe_environment, machine_line
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
-from gp_ground_seg.ros.node_process import INPUT, OUTPUTS, Link, NodeProcess, private_session
+from gp_ground_seg.ros.loader import CHANGED
+from gp_ground_seg.ros.node_process import INPUT, OUTPUTS, NodeProcess, private_session
 
 SILENCE = 2.0
 """Time without a cloud after which what is still missing is lost [s]."""
 N_READ, N_SIMULATED = 30, 10  # different clouds
-RATES, N_SENT = (10.0, 20.0, 50.0), 600  # [Hz], clouds at each
+N_SENT, N_PEER = 600, 100  # clouds at each rate, to the node and to Patchwork++
+IMU_PERIOD = 0.005  # [s]
 PERCENTILES = {50: 'p50 [ms]', 95: 'p95', 99: 'p99', 100: 'worst'}
-
-
-def dropped_by_node(session, arrays):
-    """Clouds that the node has dropped, by its next report."""
-    arrays.clear()
-    end = time.monotonic() + 5.0
-    while not arrays and time.monotonic() < end:
-        session.spin(0.05)
-    for status in (status for array in arrays for status in array.status):
-        if status.name.endswith(': processing'):
-            return int({e.key: e.value for e in status.values}['Dropped since startup'])
-    raise TimeoutError('no diagnostics of the node within 5 s')
 
 
 class Probe:
@@ -82,67 +73,83 @@ class Probe:
             for stamp, sent in self._sent.items()
             if len(back := self._back.get(stamp, {})) == len(OUTPUTS)
         ]
-        first, *_, last = self._sent.values()
         n_sent = len(self._sent)
         percents = np.percentile(latency or [np.nan], [*PERCENTILES])
         return {
             'rate [Hz]': rate,
-            'sent [Hz]': 1e9 * (n_sent - 1) / (last - first),
             'sent': n_sent,
             'lost': n_sent - len(latency),
             **dict(zip(PERCENTILES.values(), percents, strict=True)),
         }
 
 
-def restamped(clouds, start):
-    """Yield clouds over and over, stamped every 0.1 s from the second `start` on."""
-    for k, cloud in enumerate(itertools.cycle(clouds)):
-        yield with_stamp(cloud, 10**9 * start + 10**8 * k)
+def cpu_of_peer(scans, rate):
+    """CPU time of Patchwork++ for a scan, called at a rate [Hz]; NaN where it is not installed."""
+    try:
+        peer = PatchworkppMethod()
+    except ImportError:
+        return np.nan
+    start, cpu = time.monotonic(), 0.0
+    for k in range(N_PEER):
+        time.sleep(max(0.0, start + k / rate - time.monotonic()))
+        before = time.process_time()
+        peer.run(scans[k % len(scans)])
+        cpu += time.process_time() - before
+    return cpu / N_PEER
 
 
-def cpu_of(pid):
-    """CPU time of a process and of those of its children that have ended [s]."""
-    fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
-    return sum(map(int, fields[11:15])) / os.sysconf('SC_CLK_TCK')
+def send_orientations(session):
+    """Send what a level IMU does."""
+    from sensor_msgs.msg import Imu
+
+    publisher, level = session.node.create_publisher(Imu, 'imu', 10), Imu()
+    level.header.frame_id, level.orientation.w = FRAME_ID, 1.0
+
+    def send():
+        level.header.stamp = session.node.get_clock().now().to_msg()
+        publisher.publish(level)
+
+    session.node.create_timer(IMU_PERIOD, send)
 
 
-def measure(clouds, ros_args):
-    """Results at each rate, with what the node says it dropped, and its CPU time of a cloud."""
-    from diagnostic_msgs.msg import DiagnosticArray
-
-    stamped = restamped(clouds, 1_700_000_000)
-    with (
-        private_session('node_bench') as (session, own),
-        tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
-        NodeProcess(Path(folder, 'log'), [*own, *ros_args]) as node,
-    ):
-        arrays, results = [], []
-        session.node.create_subscription(DiagnosticArray, '/diagnostics', arrays.append, 10)
-        Link(session, node).connect(clouds[0])
-        while not node.is_compiled() and 'runtime.backend:=numpy' not in ros_args:
-            session.sleep(0.2)
+def measure(scans, given):
+    """Results at each rate, with the CPU time of a cloud; print what the node says of its own."""
+    clouds = itertools.cycle([cloud_from_points(points, 0, FRAME_ID) for points in scans])
+    endless = (with_stamp(cloud, time.time_ns()) for cloud in clouds)
+    words = ['-p', 'frame.level:=imu', *given.ros_args] if given.imu else given.ros_args
+    expected, results = 'listening' if given.at_once else CHANGED, []
+    with private_session('node_bench') as (session, own), tempfile.TemporaryDirectory() as folder:
+        node = NodeProcess(Path(folder, 'log'), [*own, *words])
+        with node:
+            probe = Probe(session)
+            if given.imu:
+                send_orientations(session)
+            while not any(expected in line for line in node.log_lines()):
+                session.spin(0.1)
+                node.check()
+            if not given.at_once:  # DDS connects meanwhile
+                probe.send(itertools.islice(endless, 20), 10.0, lambda: None)
+            for rate in given.rates:
+                cpu = cpu_seconds(node.pid)
+                with progress(f'{rate:g} Hz')(total=N_SENT) as bar:
+                    found = probe.send(itertools.islice(endless, N_SENT), rate, bar.update)
+                found['CPU [ms]'] = 1e3 * (cpu_seconds(node.pid) - cpu) / N_SENT
+                results.append({**found, 'Patchwork++ [ms]': 1e3 * cpu_of_peer(scans, rate)})
             node.check()
-        probe = Probe(session)
-        for rate in RATES:
-            before, cpu = dropped_by_node(session, arrays), cpu_of(node.pid)
-            with progress(f'{rate:g} Hz')(total=N_SENT) as bar:
-                found = probe.send(itertools.islice(stamped, N_SENT), rate, bar.update)
-            found['CPU [ms]'] = 1e3 * (cpu_of(node.pid) - cpu) / N_SENT
-            n_dropped = dropped_by_node(session, arrays) - before
-            results.append({**found, 'reported': n_dropped})
-        node.check()
+        print(*(line for line in node.log_lines() if CHANGED in line or 'ends' in line), sep='\n')
     return results
 
 
 def main():
     """Measure, and print a table."""
-    words, mark, ros_args = sys.argv[1:], '--ros-args', []
-    if mark in words:
-        words, ros_args = words[: words.index(mark)], words[words.index(mark) + 1 :]
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('root', nargs='?')
     parser.add_argument('--sensor', choices=SENSORS, default='hdl-64e', help='that is simulated')
-    given = parser.parse_args(words)
+    parser.add_argument('--rates', type=float, nargs='+', default=[10.0, 20.0, 50.0], help='[Hz]')
+    parser.add_argument('--at-once', action='store_true', help='before its code is compiled')
+    parser.add_argument('--imu', action='store_true', help='levelled by one that sends at 200 Hz')
+    parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], help='for the node')
+    given = parser.parse_args()
     if given.root:
         scans = [frame.points for frame in frames(given.root)[:N_READ]]
     else:
@@ -150,11 +157,10 @@ def main():
             simulate_scan(SCENES['urban'](1), SENSORS[given.sensor], np.random.default_rng(k), k)
             .points for k in range(N_SIMULATED)
         ]  # fmt: skip
-    clouds = [cloud_from_points(points, 0, FRAME_ID) for points in scans]
     n_points = sum(map(len, scans)) / len(scans)
     source = given.root or f'simulated {given.sensor}'
     print(f'{source}: {len(scans)} clouds of {n_points:.0f} points')
-    print(pd.DataFrame(measure(clouds, ros_args)).round(1).to_string(index=False))
+    print(pd.DataFrame(measure(scans, given)).round(1).to_string(index=False))
     print(machine_line(describe_environment(), 'numba'))
 
 
