@@ -43,10 +43,7 @@ _X, _Y, _BASE, N_COLUMNS = SUMS, SUMS + 1, SUMS + 2, SUMS + 3
 def find_faces(
     scan: Scan, height: float, config: FacesConfig, label: LabelConfig, faces: Faces
 ) -> None:
-    """Find the tiles of a scan that show no ground, into `faces`, which has none yet.
-
-    Points are (3, N).
-    """
+    """Find the tiles of a scan, of points (3, N), that show no ground, into empty `faces`."""
     tiles, candidates, n_bins = scan.tiles, scan.candidates, len(scan.grid.edges) - 1
     shows_ground, tolerance = np.zeros(len(tiles.place), np.bool_), label.ground_tolerance
     for m in range(len(candidates.offsets) - 1):
@@ -88,60 +85,63 @@ def _mark_scattered(
     faces: Faces,
 ) -> None:
     """Mark raised tiles about which many scatter. See the plain `vote_on_scatter`."""
-    n, face, lifts = len(tall), face_height(label), np.full(len(tall), np.nan)
-    own = np.full(n, UNKNOWN)
-    for k in range(n):
-        low, high = tiles.extremes[tall[k], 0], tiles.extremes[tall[k], 1]
-        over = np.float64(low) + height
+    n, n_own, face, n_sides = 0, 0, face_height(label), int(math.sqrt(len(tiles.at)))
+    raised, own, whole = np.empty_like(tall), np.empty(len(tall)), np.empty((len(tall), SUMS))
+    for k in range(len(tall)):
+        low, high = np.float64(tiles.extremes[tall[k], 0]), np.float64(tiles.extremes[tall[k], 1])
         if faces.is_face[tall[k]]:
             continue
-        if over > 0.5 * face:
-            lifts[k] = over
-        elif over > -0.5 * face and np.float64(high) - np.float64(low) <= face:
-            own[k] = square[k]
-    limit = _limit_of(own)
-    small = _squares_of_blocks(tiles, tall, sums, lifts, 1)
-    large = _squares_of_blocks(tiles, tall, sums, lifts, 2)
-    level = np.full(n, UNKNOWN_LEVEL, np.int32)
-    for k in range(n):
-        if lifts[k] > 0.0:
-            level[k] = vote_on_scatter(square[k], small[k], large[k], limit)
-    about = levels_about(tiles.place[tall], level, int(math.sqrt(len(tiles.at))), SCATTERED, 0)
-    for k in range(n):
-        if level[k] != UNKNOWN_LEVEL and about[k] > 0 and lifts[k] > face:
-            faces.is_face[tall[k]] = faces.has_occluded_base[tall[k]] = True
-
-
-@jit()
-def _limit_of(square: FloatArray) -> float:
-    """See the plain one."""
-    _, counts = levels_of(square, SQUARE_SCATTERS)
-    return float(smooth_up_to(SCATTER[level_at(counts, counts.sum(), OWN_SHARE)]))
-
-
-@jit()
-def _squares_of_blocks(
-    tiles: Tiles, tall: CellArray, sums: FloatArray, lifts: FloatArray, shift: int
-) -> FloatArray:
-    """See the plain one; tiles are `lifts` (K,) over the own level [m], NaN of those to leave."""
-    n_sides, square, none = int(math.sqrt(len(tiles.at))), np.empty(len(tall)), np.zeros(SUMS)
-    width, raised = (n_sides - 1 >> shift) + 1, np.flatnonzero(lifts > 0.0)
-    number, n = np.full(width * width, OUTSIDE, np.int32), 0
-    blocks, block = np.zeros((len(raised), SUMS)), np.empty(len(tall), np.int32)
-    for k in raised:
-        column, row = tiles.place[tall[k]] // n_sides, tiles.place[tall[k]] % n_sides
-        place = (column >> shift) * width + (row >> shift)
-        if number[place] < 0:
-            number[place] = n
+        if low + height > 0.5 * face:
+            raised[n] = k
+            for i in range(SUMS):
+                whole[n, i] = sums[2 * k, i] + sums[2 * k + 1, i]
             n += 1
-        block[k] = number[place]
+        elif low + height > -0.5 * face and high - low <= face:
+            own[n_own] = square[k]
+            n_own += 1
+    _, counts = levels_of(own[:n_own], SQUARE_SCATTERS)
+    limit = smooth_up_to(SCATTER[level_at(counts, counts.sum(), OWN_SHARE)])
+    raised, level = raised[:n], np.empty(n, np.int32)
+    place, square = tiles.place[tall[raised]], square[raised]
+    block, places, blocks, small = _merged(place, n_sides, whole[:n])
+    wide_block, _, _, large = _merged(places, (n_sides + 1) // 2, blocks)
+    for k in range(n):
+        b = np.uintp(block[k])
+        level[k] = vote_on_scatter(square[k], small[b], large[np.uintp(wide_block[b])], limit)
+    about = levels_about(place, level, n_sides, SCATTERED, 0)
+    for k in range(n):
+        t = tall[raised[k]]
+        over = np.float64(tiles.extremes[t, 0]) + height
+        if level[k] != UNKNOWN_LEVEL and about[k] > 0 and over > face:
+            faces.is_face[t] = faces.has_occluded_base[t] = True
+
+
+@jit()
+def _merged(
+    place: CellArray, n_sides: int, sums: FloatArray
+) -> tuple[CellArray, CellArray, FloatArray, FloatArray]:
+    """Add up `sums` (K, SUMS) of places in blocks of two by two.
+
+    Return the block of each; and of the blocks the place, where a row has half as many, the sums,
+    and `slope_square`.
+    """
+    width, n = (n_sides + 1) // 2, 0
+    number, block, places = np.zeros(width * width, np.int32), np.empty_like(place), place.copy()
+    blocks, square, none = np.zeros_like(sums), np.empty(len(sums)), np.zeros(SUMS)
+    for k in range(len(place)):
+        # A division of whole numbers takes longer.
+        column = np.int32((place[k] + 0.5) / n_sides)
+        at = np.uintp((column >> 1) * width + (place[k] - column * n_sides >> 1))
+        if number[at] == 0:
+            places[n] = at
+            n += 1
+            number[at] = n
+        block[k] = number[at] - 1
         for i in range(SUMS):
-            blocks[block[k], i] += sums[2 * k, i] + sums[2 * k + 1, i]
+            blocks[block[k], i] += sums[k, i]
     for b in range(n):
-        blocks[b, 0] = slope_square(blocks[b], none)
-    for k in raised:
-        square[k] = blocks[block[k], 0]
-    return square
+        square[b] = slope_square(blocks[b], none)
+    return block, places[:n], blocks[:n], square
 
 
 @jit()
