@@ -239,12 +239,10 @@ def moments(foot: FloatArray, rest: FloatArray) -> tuple[Values, ...]:
     or (SUMS, T) of T tiles; coordinates are relative to any point of the tile [m].
     """
     n, x, y, z = foot[0] + rest[0], foot[1] + rest[1], foot[2] + rest[2], foot[3] + rest[3]
-    xx = foot[4] + rest[4] - x * x / n
-    yy = foot[5] + rest[5] - y * y / n
-    zz = foot[6] + rest[6] - z * z / n
-    xy = foot[7] + rest[7] - x * y / n
-    xz = foot[8] + rest[8] - x * z / n
-    yz = foot[9] + rest[9] - y * z / n
+    inverse = 1.0 / n  # one division, which takes as long as ten multiplications
+    mx, my, mz = x * inverse, y * inverse, z * inverse
+    xx, yy, zz = foot[4] + rest[4] - mx * x, foot[5] + rest[5] - my * y, foot[6] + rest[6] - mz * z
+    xy, xz, yz = foot[7] + rest[7] - mx * y, foot[8] + rest[8] - mx * z, foot[9] + rest[9] - my * z
     return n, xx, yy, zz, xy, xz, yz
 
 
