@@ -236,11 +236,9 @@ def grow_inliers(
 ) -> None:
     """Let the inliers of every `step`-th segment grow from seeds, in `found`, under `theta`.
 
-    A candidate joins when the predictive standard deviation, or the residual, is at most
-    ``growth.max_std``, and the standardised residual at most
-    ``growth.max_standardised_residual``; or when the ground carries on to it from the inlier
-    before (see `carries_on`). This repeats until none joins (GP-INSAC of Chen et al. 2014; the
-    paper's outlier rejection).
+    A candidate joins when its height `fits` the prediction, or when the ground carries on to it
+    from the inlier before (see `carries_on`). This repeats until none joins (GP-INSAC of Chen et
+    al. 2014; the paper's outlier rejection).
 
     `from_neighbours` is the evidence of the segments beside each. If ``label.rule`` is roughness,
     a candidate among others, or that joins in doubt, shows less: see `noise_among` and
