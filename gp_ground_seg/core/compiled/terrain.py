@@ -9,6 +9,8 @@ from gp_ground_seg.core.frame import BoolArray, Candidates, Faces, FloatArray, I
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig
 from gp_ground_seg.core.pipeline.terrain import (
+    EVEN,
+    HIDES,
     MIN_ENTRY,
     MIN_SEEDS,
     N_ASIDE,
@@ -19,6 +21,7 @@ from gp_ground_seg.core.pipeline.terrain import (
     can_step,
     falls,
     goes_on,
+    hides,
     is_gentle,
     largest_gap,
     least_width,
@@ -32,7 +35,7 @@ class _Walk(NamedTuple):
     parent: IntArray  # (C,) a tree for each group of candidates that steps join
     is_raised: BoolArray  # (C,) allowed candidates that are raised
     part: IntArray  # (C,) as `parent`, by steps between raised candidates alone
-    is_foot: BoolArray  # (C,) raised candidates, to which it is too steep from one that is not
+    even: IntArray  # (C,) as `parent`, by even steps
     is_entry: BoolArray  # (C,) raised candidates that a step from one that is not leads to
     is_fallen: BoolArray  # (C,) candidates that a fall leads to
 
@@ -48,8 +51,9 @@ def reachable(
     """See the plain `reachable`, of which the second result is `stands`, to be set."""
     r, n = candidates.r, len(candidates.r)
     allowed, is_steep = np.empty(n, np.bool_), np.empty(n, np.bool_)
-    marks = np.zeros((4, n), np.bool_)
-    walk = _Walk(np.arange(n), marks[0], np.arange(n), marks[1], marks[2], marks[3])
+    marks = np.zeros((5, n), np.bool_)
+    is_seed, is_own = marks[3], marks[4]
+    walk = _Walk(np.arange(n), marks[0], np.arange(n), np.arange(n), marks[1], marks[2])
     for c in range(n):
         tile = np.uintp(candidates.tile[c])
         allowed[c], is_steep[c] = r[c] < REACH and not faces.is_face[tile], faces.is_steep[tile]
@@ -61,17 +65,34 @@ def reachable(
     _step_in_front(candidates, down, is_steep, walk)
     is_terrain = allowed.copy()
     _leave_out_not_entered(candidates, walk, is_terrain, stands)
-    parent, n_seeds = walk.parent, np.zeros(n, np.int64)
     for c in range(n):
         walk.is_fallen[c] &= is_terrain[c] and is_terrain[c - 1]
         if walk.is_fallen[c]:
-            _join(parent, c - 1, c)
-    for c in range(n):
-        parent[c] = _root(parent, c)
+            _join(walk.parent, c - 1, c)
+        over = abs(candidates.z[c] + height)
         is_near = allowed[c] and r[c] < growth.seed_range
-        if is_near and abs(candidates.z[c] + height) < growth.seed_height_tolerance:
-            n_seeds[parent[c]] += 1
-    result: BoolArray = is_terrain & (n_seeds[parent] >= MIN_SEEDS)
+        is_seed[c] = is_near and over < growth.seed_height_tolerance
+        is_own[c] = is_seed[c] and over < 0.5 * HIDES
+    result: BoolArray = is_terrain & _reached(walk.parent, is_seed)
+    is_even = _reached(walk.even, is_own)
+    for m in range(len(candidates.offsets) - 1):
+        is_before_own = True
+        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            over = candidates.z[c] + height
+            is_before_own &= not (allowed[c] and over < 0.5 * HIDES)
+            is_alone = is_before_own and not is_even[c]
+            stands[c] |= is_alone and hides(r[c], over, result[c], growth)
+    return result
+
+
+@jit()
+def _reached(parent: IntArray, is_seed: BoolArray) -> BoolArray:
+    """See the plain `_reached`; each candidate becomes the child of its root."""
+    n_seeds = np.zeros(len(parent), np.int64)
+    for c in range(len(parent)):
+        parent[c] = _root(parent, c)
+        n_seeds[parent[c]] += is_seed[c]
+    result: BoolArray = n_seeds[parent] >= MIN_SEEDS
     return result
 
 
@@ -88,13 +109,6 @@ def _step(walk: _Walk, a: int, b: int) -> None:
 
 
 @jit()
-def _mark_foot(walk: _Walk, a: int, b: int) -> None:
-    """Mark the one of two candidates that is raised, if the other is not."""
-    if walk.is_raised[a] != walk.is_raised[b]:
-        walk.is_foot[a if walk.is_raised[a] else b] = True
-
-
-@jit()
 def _leave_out_not_entered(
     candidates: Candidates, walk: _Walk, is_terrain: BoolArray, stands: BoolArray
 ) -> None:
@@ -106,14 +120,12 @@ def _leave_out_not_entered(
             is_before[c] = sees_lower and walk.is_raised[c]
             sees_lower |= is_terrain[c] and not walk.is_raised[c]
     entry = _widths(candidates, walk.part, walk.is_entry)
-    foot = _widths(candidates, walk.part, walk.is_foot)
     before = _widths(candidates, walk.part, is_before)
     for c in range(len(is_terrain)):
         if walk.is_raised[c]:
             part = _root(walk.part, c)
             is_terrain[c] = entry[part] >= MIN_ENTRY
-            has_foot = min(foot[part], before[part]) >= MIN_ENTRY
-            stands[c] = has_foot and not is_terrain[c]
+            stands[c] = before[part] >= MIN_ENTRY and not is_terrain[c]
 
 
 @jit()
@@ -155,12 +167,11 @@ def _step_along(
                 is_taken = dr <= longest_gap(r[c]) and _goes_on(candidates, offsets[m], c)
             else:
                 over_steep, is_taken = is_steep[c - 1] or is_steep[c], can_step(dr, rise, STEEP)
+                if can_step(dr, rise, EVEN):
+                    _join(walk.even, c - 1, c)
                 if is_taken and is_gentle(rise, over_steep):
                     _step(walk, c - 1, c)
                     continue
-                is_sheer = over_steep or not can_step(dr, rise, math.inf)
-                if is_sheer and (is_taken or not falls(dr, rise)):
-                    _mark_foot(walk, c - 1, c)
             walk.is_fallen[c] = not is_taken and falls(dr, rise)
             is_end[c] = is_taken
             is_end_down[c] = walk.is_fallen[c] or (is_taken and rise < 0.0)
@@ -246,16 +257,16 @@ def _step_aside(
                 dr = abs(r[there] - r[c])
                 # Most are joined already; of raised ones it also matters what leads to them.
                 is_done = walk.parent[c] == walk.parent[there]
+                is_done &= walk.even[c] == walk.even[there]
                 if is_done and not (walk.is_raised[c] or walk.is_raised[there]):
                     continue
                 if allowed[there] and dr <= gap:
                     distance = math.sqrt(dr * dr + across * across)
                     rise, over_steep = z[there] - z[c], is_steep[c] or is_steep[there]
-                    can_be = can_step(distance, rise, math.inf)
-                    if can_be and is_gentle(rise, over_steep):
+                    if can_step(distance, rise, EVEN):
+                        _join(walk.even, c, there)
+                    if can_step(distance, rise, STEEP) and is_gentle(rise, over_steep):
                         _step(walk, c, there)
-                    elif over_steep or not can_be:
-                        _mark_foot(walk, c, there)
 
 
 @jit()
