@@ -10,10 +10,10 @@ from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig
 from gp_ground_seg.core.pipeline.terrain import (
     EVEN,
-    HIDES,
     MIN_ENTRY,
     MIN_SEEDS,
     N_ASIDE,
+    OWN,
     RAISED,
     REACH,
     STEEP,
@@ -36,6 +36,7 @@ class _Walk(NamedTuple):
     is_raised: BoolArray  # (C,) allowed candidates that are raised
     part: IntArray  # (C,) as `parent`, by steps between raised candidates alone
     even: IntArray  # (C,) as `parent`, by even steps
+    is_foot: BoolArray  # (C,) raised candidates, to which it is too steep from one that is not
     is_entry: BoolArray  # (C,) raised candidates that a step from one that is not leads to
     is_fallen: BoolArray  # (C,) candidates that a fall leads to
 
@@ -51,9 +52,9 @@ def reachable(
     """See the plain `reachable`, of which the second result is `stands`, to be set."""
     r, n = candidates.r, len(candidates.r)
     allowed, is_steep = np.empty(n, np.bool_), np.empty(n, np.bool_)
-    marks = np.zeros((5, n), np.bool_)
-    is_seed, is_own = marks[3], marks[4]
-    walk = _Walk(np.arange(n), marks[0], np.arange(n), np.arange(n), marks[1], marks[2])
+    marks, is_seed = np.zeros((4, n), np.bool_), np.empty(n, np.bool_)
+    parent, part, even, is_own = np.arange(n), np.arange(n), np.arange(n), is_seed.copy()
+    walk = _Walk(parent, marks[0], part, even, marks[1], marks[2], marks[3])
     for c in range(n):
         tile = np.uintp(candidates.tile[c])
         allowed[c], is_steep[c] = r[c] < REACH and not faces.is_face[tile], faces.is_steep[tile]
@@ -68,20 +69,19 @@ def reachable(
     for c in range(n):
         walk.is_fallen[c] &= is_terrain[c] and is_terrain[c - 1]
         if walk.is_fallen[c]:
-            _join(walk.parent, c - 1, c)
-        over = abs(candidates.z[c] + height)
-        is_near = allowed[c] and r[c] < growth.seed_range
-        is_seed[c] = is_near and over < growth.seed_height_tolerance
-        is_own[c] = is_seed[c] and over < 0.5 * HIDES
-    result: BoolArray = is_terrain & _reached(walk.parent, is_seed)
-    is_even = _reached(walk.even, is_own)
+            _join(parent, c - 1, c)
+        over = candidates.z[c] + height
+        is_seed[c] = allowed[c] and r[c] < growth.seed_range
+        is_seed[c] &= abs(over) < growth.seed_height_tolerance
+        is_own[c] = allowed[c] and over < OWN
+    result: BoolArray = is_terrain & _reached(parent, is_seed)
+    is_even = _reached(even, is_own)
     for m in range(len(candidates.offsets) - 1):
-        is_before_own = True
+        sees_own = False
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
-            over = candidates.z[c] + height
-            is_before_own &= not (allowed[c] and over < 0.5 * HIDES)
-            is_alone = is_before_own and not is_even[c]
-            stands[c] |= is_alone and hides(r[c], over, result[c], growth)
+            sees_own |= is_own[c]
+            if not (sees_own or is_even[c]):
+                stands[c] |= hides(r[c], candidates.z[c] + height, result[c], growth)
     return result
 
 
@@ -109,6 +109,13 @@ def _step(walk: _Walk, a: int, b: int) -> None:
 
 
 @jit()
+def _mark_foot(walk: _Walk, a: int, b: int) -> None:
+    """Mark the one of two candidates that is raised, if the other is not."""
+    if walk.is_raised[a] != walk.is_raised[b]:
+        walk.is_foot[a if walk.is_raised[a] else b] = True
+
+
+@jit()
 def _leave_out_not_entered(
     candidates: Candidates, walk: _Walk, is_terrain: BoolArray, stands: BoolArray
 ) -> None:
@@ -120,12 +127,14 @@ def _leave_out_not_entered(
             is_before[c] = sees_lower and walk.is_raised[c]
             sees_lower |= is_terrain[c] and not walk.is_raised[c]
     entry = _widths(candidates, walk.part, walk.is_entry)
+    foot = _widths(candidates, walk.part, walk.is_foot)
     before = _widths(candidates, walk.part, is_before)
     for c in range(len(is_terrain)):
         if walk.is_raised[c]:
             part = _root(walk.part, c)
             is_terrain[c] = entry[part] >= MIN_ENTRY
-            stands[c] = before[part] >= MIN_ENTRY and not is_terrain[c]
+            has_foot = min(foot[part], before[part]) >= MIN_ENTRY
+            stands[c] = has_foot and not is_terrain[c]
 
 
 @jit()
@@ -172,6 +181,9 @@ def _step_along(
                 if is_taken and is_gentle(rise, over_steep):
                     _step(walk, c - 1, c)
                     continue
+                is_sheer = over_steep or not can_step(dr, rise, math.inf)
+                if is_sheer and (is_taken or not falls(dr, rise)):
+                    _mark_foot(walk, c - 1, c)
             walk.is_fallen[c] = not is_taken and falls(dr, rise)
             is_end[c] = is_taken
             is_end_down[c] = walk.is_fallen[c] or (is_taken and rise < 0.0)
@@ -265,8 +277,11 @@ def _step_aside(
                     rise, over_steep = z[there] - z[c], is_steep[c] or is_steep[there]
                     if can_step(distance, rise, EVEN):
                         _join(walk.even, c, there)
-                    if can_step(distance, rise, STEEP) and is_gentle(rise, over_steep):
+                    can_be = can_step(distance, rise, math.inf)
+                    if can_be and is_gentle(rise, over_steep):
                         _step(walk, c, there)
+                    elif over_steep or not can_be:
+                        _mark_foot(walk, c, there)
 
 
 @jit()

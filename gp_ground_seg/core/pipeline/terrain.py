@@ -44,9 +44,9 @@ MIN_SEEDS = 8
 RAISED, MIN_ENTRY = 0.3, 1.5
 """Height from which terrain is raised [m]; width over which steps must lead up to it [m], as few
 lead to a car. A raised part that fewer lead to is an object, if its foot is seen so wide."""
-EVEN, BLIND, HIDES = 0.12, 5.0, 0.22
-"""Largest rise of a step on even terrain [m]; range up to which what no such steps lead to hides
-the ground before it [m], if it is so much higher [m]."""
+EVEN, OWN, HIDES, BLIND = 0.12, 0.11, 0.22, 5.0
+"""Largest rise of an even step; height up to which the own level is seen, and that from which what
+is nearer than that, within this range, hides it unless even steps lead there [m]."""
 SQUARE = 2.0
 """Side of the squares that the relief of the terrain is in [m]."""
 MIN_FALL = math.sqrt(2.0) * SQUARE
@@ -77,17 +77,18 @@ def reachable(
     over_steep, is_near = is_steep[first] | is_steep[second], ~steps.is_long & ~is_fall
     can_be = is_near & can_step(steps.length, rise, math.inf)
     taken, is_even = can_be & is_gentle(rise, over_steep), can_be & (np.abs(rise) <= EVEN)
+    is_sheer = is_near & ~taken & (over_steep | ~can_be)
     is_steep_step = steps.is_long | (can_be & (second == first + 1) & (np.abs(rise) <= STEEP))
     is_steep_step &= ~taken
     for wanted in (is_steep_step, is_fall | (is_steep_step & (rise < 0.0))):
         taken[wanted] |= _in_front(candidates, first[wanted], over_steep[wanted])
-    is_own = is_seed & (np.abs(candidates.z) < 0.5 * HIDES)
-    is_even = _reached(is_own, first[is_even], second[is_even])
-    is_terrain, stands = _entered(candidates, allowed, steps, taken & ~is_fall)
+    is_terrain, stands = _entered(candidates, allowed, steps, taken & ~is_fall, is_sheer)
     taken &= ~is_fall | (is_terrain[first] & is_terrain[second])
     is_reached = is_terrain & _reached(is_seed, first[taken], second[taken])
-    is_before = _before_own(candidates, allowed) & ~is_even
-    stands |= is_before & hides(candidates.r, candidates.z, is_reached, growth)
+    is_own = allowed & (candidates.z < OWN)
+    stands |= hides(candidates.r, candidates.z, is_reached, growth) & ~(
+        _sees(is_own, candidates) | _reached(is_own, first[is_even], second[is_even])
+    )
     return is_reached, stands
 
 
@@ -98,12 +99,11 @@ def _reached(is_seed: BoolArray, first: IntArray, second: IntArray) -> BoolArray
     return result
 
 
-def _before_own(candidates: Candidates, allowed: BoolArray) -> BoolArray:
-    """Candidates before which none of their segment is as low as the own level, (C,)."""
-    own = np.flatnonzero(allowed & (candidates.z < 0.5 * HIDES))[::-1]
-    nearest = np.full(len(candidates.offsets) - 1, len(allowed))
-    nearest[candidates.segment[own]] = own
-    result: BoolArray = np.arange(len(allowed)) < nearest[candidates.segment]
+def _sees(is_own: BoolArray, candidates: Candidates) -> BoolArray:
+    """Whether the own level is seen before each candidate, or there, (C,)."""
+    number = np.append(0, np.cumsum(is_own))
+    first = candidates.offsets[candidates.segment]
+    result: BoolArray = number[1:] > number[first]
     return result
 
 
@@ -112,6 +112,7 @@ def _entered(
     allowed: BoolArray,
     steps: _Steps,
     taken: BoolArray,
+    is_sheer: BoolArray,
 ) -> tuple[BoolArray, BoolArray]:
     """Candidates that may be terrain, and those that stand on the ground, two (C,).
 
@@ -142,7 +143,7 @@ def _entered(
     last[candidates.segment[low]] = low
     is_before_low = is_raised & (np.arange(len(allowed)) < last[candidates.segment])
     stands = is_raised & ~is_entered
-    stands &= is_wide(np.flatnonzero(is_before_low))
+    stands &= is_wide(upper[leads_up & is_sheer]) & is_wide(np.flatnonzero(is_before_low))
     return allowed & (~is_raised | is_entered), stands
 
 
