@@ -146,6 +146,7 @@ STANDING = {
         False,
     ),
     'bank': (bank(25, 10.0), False),
+    'shelf': (box(0.0, 4.5, -2.0, 2.0, 0.27), True),
 }
 
 
@@ -157,7 +158,7 @@ def test_what_stands_on_the_ground_has_ground_before_and_behind_it(backend, name
     tile = candidates.tile // per_tile
     faces = backend.find_relief(candidates._replace(tile=tile), NO_FACES, HEIGHT, Config())[2]
     expected = np.full(tile[-1] + 1, stands)
-    np.logical_and.at(expected, tile, candidates.z + HEIGHT > 0.3)
+    np.logical_and.at(expected, tile, candidates.z + HEIGHT > 0.25)
     np.testing.assert_array_equal(np.stack(faces[:2])[:, : len(expected)], [expected] * 2)
     assert not NO_FACES.is_face.any()
 

@@ -9,9 +9,11 @@ from gp_ground_seg.core.frame import BoolArray, Candidates, Faces, FloatArray, I
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig
 from gp_ground_seg.core.pipeline.terrain import (
+    EVEN,
     MIN_ENTRY,
     MIN_SEEDS,
     N_ASIDE,
+    OWN,
     RAISED,
     REACH,
     STEEP,
@@ -19,6 +21,7 @@ from gp_ground_seg.core.pipeline.terrain import (
     can_step,
     falls,
     goes_on,
+    hides,
     is_gentle,
     largest_gap,
     least_width,
@@ -32,6 +35,7 @@ class _Walk(NamedTuple):
     parent: IntArray  # (C,) a tree for each group of candidates that steps join
     is_raised: BoolArray  # (C,) allowed candidates that are raised
     part: IntArray  # (C,) as `parent`, by steps between raised candidates alone
+    even: IntArray  # (C,) as `parent`, by even steps
     is_foot: BoolArray  # (C,) raised candidates, to which it is too steep from one that is not
     is_entry: BoolArray  # (C,) raised candidates that a step from one that is not leads to
     is_fallen: BoolArray  # (C,) candidates that a fall leads to
@@ -48,8 +52,9 @@ def reachable(
     """See the plain `reachable`, of which the second result is `stands`, to be set."""
     r, n = candidates.r, len(candidates.r)
     allowed, is_steep = np.empty(n, np.bool_), np.empty(n, np.bool_)
-    marks = np.zeros((4, n), np.bool_)
-    walk = _Walk(np.arange(n), marks[0], np.arange(n), marks[1], marks[2], marks[3])
+    marks, is_seed = np.zeros((4, n), np.bool_), np.empty(n, np.bool_)
+    parent, part, even, is_own = np.arange(n), np.arange(n), np.arange(n), is_seed.copy()
+    walk = _Walk(parent, marks[0], part, even, marks[1], marks[2], marks[3])
     for c in range(n):
         tile = np.uintp(candidates.tile[c])
         allowed[c], is_steep[c] = r[c] < REACH and not faces.is_face[tile], faces.is_steep[tile]
@@ -61,17 +66,33 @@ def reachable(
     _step_in_front(candidates, down, is_steep, walk)
     is_terrain = allowed.copy()
     _leave_out_not_entered(candidates, walk, is_terrain, stands)
-    parent, n_seeds = walk.parent, np.zeros(n, np.int64)
     for c in range(n):
         walk.is_fallen[c] &= is_terrain[c] and is_terrain[c - 1]
         if walk.is_fallen[c]:
             _join(parent, c - 1, c)
-    for c in range(n):
+        over = candidates.z[c] + height
+        is_seed[c] = allowed[c] and r[c] < growth.seed_range
+        is_seed[c] &= abs(over) < growth.seed_height_tolerance
+        is_own[c] = allowed[c] and over < OWN
+    result: BoolArray = is_terrain & _reached(parent, is_seed)
+    is_even = _reached(even, is_own)
+    for m in range(len(candidates.offsets) - 1):
+        sees_own = False
+        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            sees_own |= is_own[c]
+            if not (sees_own or is_even[c]):
+                stands[c] |= hides(r[c], candidates.z[c] + height, result[c], growth)
+    return result
+
+
+@jit()
+def _reached(parent: IntArray, is_seed: BoolArray) -> BoolArray:
+    """See the plain `_reached`; each candidate becomes the child of its root."""
+    n_seeds = np.zeros(len(parent), np.int64)
+    for c in range(len(parent)):
         parent[c] = _root(parent, c)
-        is_near = allowed[c] and r[c] < growth.seed_range
-        if is_near and abs(candidates.z[c] + height) < growth.seed_height_tolerance:
-            n_seeds[parent[c]] += 1
-    result: BoolArray = is_terrain & (n_seeds[parent] >= MIN_SEEDS)
+        n_seeds[parent[c]] += is_seed[c]
+    result: BoolArray = n_seeds[parent] >= MIN_SEEDS
     return result
 
 
@@ -155,6 +176,8 @@ def _step_along(
                 is_taken = dr <= longest_gap(r[c]) and _goes_on(candidates, offsets[m], c)
             else:
                 over_steep, is_taken = is_steep[c - 1] or is_steep[c], can_step(dr, rise, STEEP)
+                if can_step(dr, rise, EVEN):
+                    _join(walk.even, c - 1, c)
                 if is_taken and is_gentle(rise, over_steep):
                     _step(walk, c - 1, c)
                     continue
@@ -246,11 +269,14 @@ def _step_aside(
                 dr = abs(r[there] - r[c])
                 # Most are joined already; of raised ones it also matters what leads to them.
                 is_done = walk.parent[c] == walk.parent[there]
+                is_done &= walk.even[c] == walk.even[there]
                 if is_done and not (walk.is_raised[c] or walk.is_raised[there]):
                     continue
                 if allowed[there] and dr <= gap:
                     distance = math.sqrt(dr * dr + across * across)
                     rise, over_steep = z[there] - z[c], is_steep[c] or is_steep[there]
+                    if can_step(distance, rise, EVEN):
+                        _join(walk.even, c, there)
                     can_be = can_step(distance, rise, math.inf)
                     if can_be and is_gentle(rise, over_steep):
                         _step(walk, c, there)

@@ -44,6 +44,9 @@ MIN_SEEDS = 8
 RAISED, MIN_ENTRY = 0.3, 1.5
 """Height from which terrain is raised [m]; width over which steps must lead up to it [m], as few
 lead to a car. A raised part that fewer lead to is an object, if its foot is seen so wide."""
+EVEN, OWN, HIDES, BLIND = 0.12, 0.11, 0.22, 5.0
+"""Largest rise of an even step; height up to which the own level is seen, and that from which what
+is nearer than that, within this range, hides it unless even steps lead there [m]."""
 SQUARE = 2.0
 """Side of the squares that the relief of the terrain is in [m]."""
 MIN_FALL = math.sqrt(2.0) * SQUARE
@@ -73,7 +76,7 @@ def reachable(
     rise = candidates.z[second] - candidates.z[first]
     over_steep, is_near = is_steep[first] | is_steep[second], ~steps.is_long & ~is_fall
     can_be = is_near & can_step(steps.length, rise, math.inf)
-    taken = can_be & is_gentle(rise, over_steep)
+    taken, is_even = can_be & is_gentle(rise, over_steep), can_be & (np.abs(rise) <= EVEN)
     is_sheer = is_near & ~taken & (over_steep | ~can_be)
     is_steep_step = steps.is_long | (can_be & (second == first + 1) & (np.abs(rise) <= STEEP))
     is_steep_step &= ~taken
@@ -81,9 +84,27 @@ def reachable(
         taken[wanted] |= _in_front(candidates, first[wanted], over_steep[wanted])
     is_terrain, stands = _entered(candidates, allowed, steps, taken & ~is_fall, is_sheer)
     taken &= ~is_fall | (is_terrain[first] & is_terrain[second])
-    group = _groups(len(allowed), first[taken], second[taken])
-    is_reached = (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
-    return is_reached & is_terrain, stands
+    is_reached = is_terrain & _reached(is_seed, first[taken], second[taken])
+    is_own = allowed & (candidates.z < OWN)
+    stands |= hides(candidates.r, candidates.z, is_reached, growth) & ~(
+        _sees(is_own, candidates) | _reached(is_own, first[is_even], second[is_even])
+    )
+    return is_reached, stands
+
+
+def _reached(is_seed: BoolArray, first: IntArray, second: IntArray) -> BoolArray:
+    """Candidates that steps lead to from enough seeds, (C,)."""
+    group = _groups(len(is_seed), first, second)
+    result: BoolArray = (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
+    return result
+
+
+def _sees(is_own: BoolArray, candidates: Candidates) -> BoolArray:
+    """Whether the own level is seen before each candidate, or there, (C,)."""
+    number = np.append(0, np.cumsum(is_own))
+    first = candidates.offsets[candidates.segment]
+    result: BoolArray = number[1:] > number[first]
+    return result
 
 
 def _entered(
@@ -210,6 +231,16 @@ def _steps(candidates: Candidates, allowed: BoolArray) -> _Steps:
     n_aside = len(first) - len(along)
     is_long, is_fall = (np.pad(kind[along], (0, n_aside)) for kind in (is_long, is_fall))
     return _Steps(first, second, length, is_long, is_fall)
+
+
+@shared
+def hides(r: Values, z: Values, is_reached: Values, growth: GrowthConfig) -> Values:
+    """Whether a candidate, `z` over the own level [m], stands if no even steps lead to it.
+
+    Of those that are higher than seeds only if it is no terrain either.
+    """
+    is_low = z < growth.seed_height_tolerance
+    return (r > GAP) & (r < BLIND) & (z > HIDES) & (is_low | ~is_reached)
 
 
 @shared
