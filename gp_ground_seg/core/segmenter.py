@@ -32,6 +32,7 @@ from gp_ground_seg.core.pipeline.ground_view import (
     UPRIGHT,
     View,
     clearest,
+    is_below_sensor,
     is_ceiling,
     is_doubtful,
     objection_to_ground,
@@ -335,7 +336,7 @@ class GroundSegmenter:
         planes = self._backend.find_planes(scan.candidates, math.tan(max_tilt))
         for plane in islice(planes, MOST_PLANES):
             if not is_ceiling(plane, scan):
-                yield View(plane, turn)
+                yield View(plane, turn, is_below_sensor(plane, scan))
 
 
 def _is_mirror(view: View, scan: Scan) -> bool:

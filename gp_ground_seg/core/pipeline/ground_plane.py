@@ -53,10 +53,6 @@ well, the tilt explains nothing. Tilt up to which levels are level [rad]: shelve
 Plane = tuple[float, float, float]
 """Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
 
-MIN_DEPRESSION = 0.105
-"""Angle to the plane of the ground at which a sensor sees the nearest of it, at least [rad]. From
-the origin of a vehicle, at its axles, a sensor on the roof seems to see it at less."""
-
 N_TRIPLES = 192
 """Planes tried through three cells each."""
 N_LEVEL = 64
@@ -113,11 +109,6 @@ class GroundPlane(NamedTuple):
         """Upward unit normal, (3,)."""
         normal = np.array([-self.slope_x, -self.slope_y, 1.0])
         return normal / math.sqrt(self.slope_x**2 + self.slope_y**2 + 1.0)
-
-    @property
-    def is_below_sensor(self) -> bool:
-        """Whether a sensor at the origin may see it: it sees the nearest of the ground steeply."""
-        return self.depression >= MIN_DEPRESSION
 
 
 def find_planes(candidates: Candidates, max_slope: float) -> Iterator[GroundPlane]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Scan, as_index
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.core.pipeline.lowest_points import FARTHEST, N_SECTORS, tolerance_at
+from gp_ground_seg.core.pipeline.lowest_points import FARTHEST, N_SECTORS, NEAREST, tolerance_at
 from gp_ground_seg.core.pipeline.points import angles_of, rotation
 
 MIN_SUPPORT = 0.35
@@ -43,6 +43,13 @@ GOOD_SUPPORT, TALL = 0.9, 6.0
 OTHER_MIN_SUPPORT, OTHER_MIN_REACH = 0.5, 10.0
 """Support of a plane about another axis, and range that it reaches [m]: walls and ceilings of
 rooms seldom do."""
+LEAST_DEPRESSION, STEEP_DEPRESSION = 0.105, 0.2
+"""Angle to the plane at which a sensor sees the nearest of it, at least, and at which no vehicle's
+origin at its axles does [rad]: a sensor on its roof seems to see it at 0.05 to 0.16 from there."""
+ONE_ANGLE = 0.05
+"""Distance of the quartiles of the steepest slopes to returns in all sectors, over the upper one,
+up to which a sensor at the origin sees them: 0.02 of a Mid-360, 0.1 and more from an origin at
+axles on hills."""
 CLEAR = 0.3
 """Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
 seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
@@ -85,6 +92,7 @@ class View(NamedTuple):
 
     plane: GroundPlane
     turn: FloatArray  # (3, 3) rotation to that frame from the one levelled by the parameters
+    is_below_sensor: bool  # whether it is seen as from a sensor at the origin
     is_mirror: bool | None = None  # whether what is below it are mirror images; None: not asked
 
     @property
@@ -157,6 +165,17 @@ def is_ceiling(plane: GroundPlane, scan: Scan) -> bool:
         return False
     height = plane.below(*scan.xyz[scan.grid.r < FARTHEST].T.astype(np.float64))
     return bool(np.count_nonzero(height > CLEAR) <= np.count_nonzero(height < -CLEAR))
+
+
+def is_below_sensor(plane: GroundPlane, scan: Scan) -> bool:
+    """Whether a plane is seen as from a sensor at the origin: steeply, or by a cone of rays."""
+    if not LEAST_DEPRESSION <= plane.depression < STEEP_DEPRESSION:
+        return plane.depression >= STEEP_DEPRESSION
+    candidates, steepest = scan.candidates, np.full(N_SECTORS, -np.inf)
+    sector = candidates.segment * N_SECTORS // candidates.n_segments
+    np.maximum.at(steepest, sector, -candidates.z / np.maximum(candidates.r, NEAREST))
+    low, high = np.quantile(steepest[np.isfinite(steepest)], (0.25, 0.75))
+    return bool(high - low < ONE_ANGLE * high)
 
 
 def is_doubtful(below: View | None) -> bool:
