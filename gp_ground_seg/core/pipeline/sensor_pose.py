@@ -60,7 +60,6 @@ class MeasuredPose:
     tells_tilt: bool  # the same for the tilt
     # in the frame levelled by the angles given, or where that is far from level in its own
     plane: GroundPlane
-    is_below_sensor: bool = False  # whether that is seen as from a sensor at the origin
     # as `height`, over another level that is seen, higher or lower; infinite if there is none [m]
     other_height: float = math.inf
 
@@ -97,7 +96,7 @@ class SensorPose:
     @property
     def starts_rays(self) -> bool:
         """Whether the ground is seen as from a sensor at the origin that was taken."""
-        return self.measured is not None and self.measured.is_below_sensor
+        return self.measured is not None and self.measured.plane.is_below_sensor
 
     @property
     def is_well_seen(self) -> bool:
@@ -182,8 +181,7 @@ def estimate_pose(
     height = plane.near_height * plane.normal[2] / (vertical @ up) - vertical @ pose.origin
     height = rounded(float(height))
     other = height + plane.other_height - plane.near_height
-    tells, is_below = (tells_height, view.tells_tilt), view.is_below_sensor
-    measured = MeasuredPose(height, *angles_of(up), *tells, plane, is_below, other)
+    measured = MeasuredPose(height, *angles_of(up), tells_height, view.tells_tilt, plane, other)
     estimates_height = sensor.height == AUTO and tells_height
     return dataclasses.replace(
         pose,
@@ -218,7 +216,7 @@ def with_fallback(pose: SensorPose, fallback: SensorPose, sensor: SensorConfig) 
 def _doubts(view: View) -> tuple[str, ...]:
     """Say why the height of the plane of `view` may not be that of the ground."""
     plane = view.plane
-    is_low = plane.near_height * plane.normal[2] < LOW and view.is_below_sensor
+    is_low = plane.near_height * plane.normal[2] < LOW and plane.is_below_sensor
     # A boolean of numpy does not multiply a tuple.
     return (LOW_GROUND,) * bool(is_low) + (LITTLE_GROUND,) * (not view.is_whole)
 
