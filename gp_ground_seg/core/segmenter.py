@@ -25,6 +25,7 @@ from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_
 from gp_ground_seg.core.gp.learning import Learned
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.parameters.schema import NO_BOX
+from gp_ground_seg.core.pipeline.ground_plane import CLEAR_TILT
 from gp_ground_seg.core.pipeline.ground_view import (
     LOWER_ENDS,
     MAX_TILT,
@@ -55,7 +56,6 @@ from gp_ground_seg.core.pipeline.points import (
     without_box,
 )
 from gp_ground_seg.core.pipeline.sensor_pose import (
-    CLEAR_TILT,
     SensorPose,
     estimate_pose,
     for_sensor,
@@ -327,8 +327,7 @@ class GroundSegmenter:
         """Best plane of a scan that may be ground, or without one the best that is no ceiling."""
         views = self._views(scan, turn, max_tilt)
         first = next(views, None)
-        seen = chain([first], views)
-        return next((view for view in seen if view is None or view.tells_height), first)
+        return next((v for v in chain([first], views) if v is None or v.tells_height), first)
 
     def _views(
         self, scan: Scan, turn: FloatArray = UPRIGHT, max_tilt: float = MAX_TILT

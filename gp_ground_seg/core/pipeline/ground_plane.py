@@ -49,6 +49,9 @@ STRAY = 0.05
 LEVEL, STRAIGHT = 1.15, 0.1
 """Support of a level plane, by that of a tilted one with as many points: where a level one does as
 well, the tilt explains nothing. Tilt up to which levels are level [rad]: shelves on one side."""
+CLEAR_TILT = 0.045
+"""Tilt from which roll and pitch that are auto level the scan [rad]: camber and a vehicle's own
+lean stay below it."""
 
 Plane = tuple[float, float, float]
 """Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
@@ -174,7 +177,7 @@ def own_level(
         own = cells._replace(inverse=np.where(d <= from_other, cells.inverse, 0.0))
     planes = np.array([best, (best[0], 0.0, 0.0)])
     loops.refine(own, planes[:1], max_slope, N_REFINEMENTS)
-    if math.hypot(planes[0, 1], planes[0, 2]) < STRAIGHT:
+    if CLEAR_TILT < math.hypot(planes[0, 1], planes[0, 2]) < STRAIGHT:
         # Low shelves on one side tilt a plane, without more support than a level one has.
         own = own._replace(x=np.zeros_like(own.x), y=np.zeros_like(own.y))
         loops.refine(own, planes[1:], max_slope, N_REFINEMENTS)

@@ -45,9 +45,11 @@ rooms seldom do."""
 LEAST_DEPRESSION, STEEP_DEPRESSION = 0.105, 0.2
 """Angle to the plane at which a sensor sees the nearest of it, at least, and at which no vehicle's
 origin at its axles does [rad]: a sensor on its roof seems to see it at 0.05 to 0.16 from there."""
+LOW = 0.2
+"""Height of the sensor below which the plane that it is over may be a table top [m]."""
 ONE_ANGLE = 0.05
 """Distance of the quartiles of the steepest angles to returns in all sectors, over the upper one,
-up to which a sensor at the origin sees them: 0.02 of a Mid-360, 0.1 or more from axles on hills."""
+up to which a sensor is at the origin: 0.02 of a Mid-360, 0.1 and more from axles on hills."""
 CLEAR = 0.3
 """Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
 seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
@@ -156,8 +158,8 @@ def is_ceiling(plane: GroundPlane, scan: Scan) -> bool:
 
 def is_below_sensor(plane: GroundPlane, scan: Scan) -> bool:
     """Whether a plane is seen as from a sensor at the origin: steeply, or by a cone of rays."""
-    if not LEAST_DEPRESSION <= plane.depression < STEEP_DEPRESSION:
-        return plane.depression >= STEEP_DEPRESSION
+    if plane.height < LOW or not LEAST_DEPRESSION <= plane.depression < STEEP_DEPRESSION:
+        return plane.depression >= LEAST_DEPRESSION
     c, steepest = scan.candidates, np.full(N_SECTORS, -np.inf)
     np.maximum.at(steepest, c.segment * N_SECTORS // c.n_segments, np.arctan2(-c.z, c.r))
     low, high = np.quantile(steepest[np.isfinite(steepest)], (0.25, 0.75))
