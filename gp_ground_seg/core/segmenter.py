@@ -10,7 +10,7 @@ import os
 import textwrap
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import islice
+from itertools import chain, islice
 from numbers import Real
 from pathlib import Path
 from time import perf_counter
@@ -25,6 +25,7 @@ from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_
 from gp_ground_seg.core.gp.learning import Learned
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.parameters.schema import NO_BOX
+from gp_ground_seg.core.pipeline.ground_plane import CLEAR_TILT
 from gp_ground_seg.core.pipeline.ground_view import (
     LOWER_ENDS,
     MAX_TILT,
@@ -32,6 +33,7 @@ from gp_ground_seg.core.pipeline.ground_view import (
     UPRIGHT,
     View,
     clearest,
+    is_below_sensor,
     is_ceiling,
     is_doubtful,
     objection_to_ground,
@@ -46,13 +48,14 @@ from gp_ground_seg.core.pipeline.mirror_images import (
 )
 from gp_ground_seg.core.pipeline.points import (
     ENOUGH_POINTS,
+    angles_of,
     moved,
     rotate,
+    rotation,
     take_points,
     without_box,
 )
 from gp_ground_seg.core.pipeline.sensor_pose import (
-    CLEAR_TILT,
     SensorPose,
     estimate_pose,
     for_sensor,
@@ -271,8 +274,8 @@ class GroundSegmenter:
         if is_turned or config.grid != self._config.grid:
             scan = backend.build_grid(pose.level(about), config)
         if objection == LOWER_ENDS and pose.is_height_default:
-            nothing = np.zeros(len(scan.candidates.r), dtype=np.bool_)
-            scan = scan._replace(candidates=scan.candidates.where(nothing))
+            # No candidate is left.
+            scan = scan._replace(candidates=scan.candidates.where(scan.candidates.r < 0.0))
         images = find_mirror_images(scan, pose, view)
         if len(images.points) > 0:
             scan = images.left_out(backend.build_grid(images.raised(scan.xyz), config))
@@ -312,11 +315,11 @@ class GroundSegmenter:
             return self._look(self._backend.build_grid(rotate(sample, turn), self._config), turn)
 
         if below is not None and below.is_steep:
-            below = look(below.levelled) or below
+            below = look(rotation(*angles_of(below.up))) or below
         if not is_doubtful(below):
             return below
         first = map(look, OTHER_AXES)
-        return clearest(below, [look(view.levelled) if view else None for view in first])
+        return clearest(below, [look(rotation(*angles_of(v.up))) if v else None for v in first])
 
     def _look(
         self, scan: Scan, turn: FloatArray = UPRIGHT, max_tilt: float = MAX_TILT
@@ -324,9 +327,7 @@ class GroundSegmenter:
         """Best plane of a scan that may be ground, or without one the best that is no ceiling."""
         views = self._views(scan, turn, max_tilt)
         first = next(views, None)
-        if first is None or first.tells_height:
-            return first
-        return next((view for view in views if view.tells_height), first)
+        return next((v for v in chain([first], views) if v is None or v.tells_height), first)
 
     def _views(
         self, scan: Scan, turn: FloatArray = UPRIGHT, max_tilt: float = MAX_TILT
@@ -335,7 +336,7 @@ class GroundSegmenter:
         planes = self._backend.find_planes(scan.candidates, math.tan(max_tilt))
         for plane in islice(planes, MOST_PLANES):
             if not is_ceiling(plane, scan):
-                yield View(plane, turn)
+                yield View(plane._replace(is_below_sensor=is_below_sensor(plane, scan)), turn)
 
 
 def _is_mirror(view: View, scan: Scan) -> bool:

@@ -25,11 +25,7 @@ from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.core.pipeline import sensor_pose
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.ground_view import LOWER_ENDS, UPRIGHT, View
-from gp_ground_seg.core.pipeline.sensor_pose import (
-    LITTLE_GROUND,
-    LOW_GROUND,
-    NO_HEIGHT,
-)
+from gp_ground_seg.core.pipeline.sensor_pose import LITTLE_GROUND, LOW_GROUND, NO_HEIGHT
 from gp_ground_seg.lab import simulation
 from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, VLP_16, Scene
 from gp_ground_seg.lab.simulation import terrain as landforms
@@ -41,9 +37,13 @@ GATES = ('growth.max_std', 'growth.seed_height_tolerance', 'label.obstacle_min_h
 
 def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicle():
     config, reference = Config(), sensor_pose.REFERENCE_HEIGHT
-    mounts = (0.6, 0.0, 0.6), (0.15, 0.0, 0.15), *((1.73, z, reference) for z in (0.0, 1.53, 1.73))
-    for height, lift, expected in mounts:
-        pose = pose_of(moved(scan_of('kerb', SMALL_VLP, height).points, lift))
+    mounts = (
+        *(('kerb', height, 0.0, height) for height in (0.6, 0.15)),
+        *(('kerb', 1.73, z, reference) for z in (0.0, 1.53, 1.73)),
+        ('hills', 0.8, 0.4, reference),
+    )
+    for scene, height, lift, expected in mounts:
+        pose = pose_of(moved(scan_of(scene, SMALL_VLP, height).points, lift))
         assert sensor_pose.sensor_height_of(pose) == pytest.approx(expected, abs=0.04)
         own, share = sensor_pose.for_sensor(config, pose), expected / reference
         if share == 1.0:

@@ -49,13 +49,12 @@ STRAY = 0.05
 LEVEL, STRAIGHT = 1.15, 0.1
 """Support of a level plane, by that of a tilted one with as many points: where a level one does as
 well, the tilt explains nothing. Tilt up to which levels are level [rad]: shelves on one side."""
+CLEAR_TILT = 0.045
+"""Tilt from which roll and pitch that are auto level the scan [rad]: camber and a vehicle's own
+lean stay below it."""
 
 Plane = tuple[float, float, float]
 """Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
-
-MIN_DEPRESSION = 0.105
-"""Angle to the plane of the ground at which a sensor sees the nearest of it, at least [rad]. From
-the origin of a vehicle, at its axles, a sensor on the roof seems to see it at less."""
 
 N_TRIPLES = 192
 """Planes tried through three cells each."""
@@ -71,7 +70,6 @@ GRAIN = 2.0**-14
 same ones."""
 MIN_CELLS = 12
 """Occupied cells from which a scan has a plane."""
-
 
 AZIMUTHS = np.arange(0.5, 60.0) * (2.0 * np.pi / 60)
 """Normals of the sides of a convex hull: a path that is seen far has narrow hulls."""
@@ -103,6 +101,7 @@ class GroundPlane(NamedTuple):
     undercut: float = 0.0
     # as `height`, of the parallel level with the next best score [m]; infinite if there is none
     other_height: float = math.inf
+    is_below_sensor: bool = False  # whether it is seen as from a sensor at the origin
 
     def below(self, x: FloatArray | float, y: FloatArray | float, z: FloatArray | float) -> Any:
         """How far below points it is, along z [m]."""
@@ -114,11 +113,6 @@ class GroundPlane(NamedTuple):
         normal = np.array([-self.slope_x, -self.slope_y, 1.0])
         return normal / math.sqrt(self.slope_x**2 + self.slope_y**2 + 1.0)
 
-    @property
-    def is_below_sensor(self) -> bool:
-        """Whether a sensor at the origin may see it: it sees the nearest of the ground steeply."""
-        return self.depression >= MIN_DEPRESSION
-
 
 def find_planes(candidates: Candidates, max_slope: float) -> Iterator[GroundPlane]:
     """Yield planes that many of the lowest points lie on and few rays cross, the best first.
@@ -128,8 +122,7 @@ def find_planes(candidates: Candidates, max_slope: float) -> Iterator[GroundPlan
     (Beaton & Tukey, Technometrics 1974) from the best of them. `max_slope` is that of the
     steepest plane to look for, as rise per metre.
     """
-    loops = Loops(best_of, refine)
-    return planes_of(lowest_points(candidates), max_slope, loops)
+    return planes_of(lowest_points(candidates), max_slope, Loops(best_of, refine))
 
 
 STEPS = 1.2207440846057596 ** -np.arange(1.0, 4.0)
@@ -169,7 +162,7 @@ def own_level(
     not refuted and goes on to where the robot stands, as the best one does not. Points that are
     nearer to a tight other level do not refine it; the crests of waves are not tight.
     """
-    best, best_score, _ = first
+    (best, best_score, _), own = first, cells
     # Points of the best plane, and those that lie alone, are of no other level.
     d = np.abs(distance(cells.x, cells.y, cells.z, best))
     is_left = (d * cells.inverse > 1.0) & ~cells.is_alone
@@ -179,13 +172,17 @@ def own_level(
     from_other = np.abs(distance(cells.x, cells.y, cells.z, other))
     whole = left.weight[from_other * cells.inverse <= 1.0].sum()
     if support > TIGHT * RESOLUTION * whole:
-        aside, other_aside = asideness(cells, best, other), asideness(cells, other, best)
-        if other_aside < OWN * aside:
+        if asideness(cells, other, best) < OWN * asideness(cells, best, other):
             best, other, d, from_other = other, best, from_other, d
-        cells = cells._replace(inverse=np.where(d <= from_other, cells.inverse, 0.0))
-    plane = np.array([best])
-    loops.refine(cells, plane, max_slope, N_REFINEMENTS)
-    return (plane[0, 0], plane[0, 1], plane[0, 2]), math.inf if score == 0.0 else other[0]
+        own = cells._replace(inverse=np.where(d <= from_other, cells.inverse, 0.0))
+    planes = np.array([best, (best[0], 0.0, 0.0)])
+    loops.refine(own, planes[:1], max_slope, N_REFINEMENTS)
+    if CLEAR_TILT < math.hypot(planes[0, 1], planes[0, 2]) < STRAIGHT:
+        # Low shelves on one side tilt a plane, without more support than a level one has.
+        own = own._replace(x=np.zeros_like(own.x), y=np.zeros_like(own.y))
+        loops.refine(own, planes[1:], max_slope, N_REFINEMENTS)
+        planes[0] = loops.best_of(planes, cells, 0.0)[0]
+    return (planes[0, 0], planes[0, 1], planes[0, 2]), math.inf if score == 0.0 else other[0]
 
 
 def hypotheses(cells: LowestPoints, max_slope: float, loops: Loops) -> FloatArray:

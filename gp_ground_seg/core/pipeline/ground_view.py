@@ -20,9 +20,8 @@ MIN_DEPTH = 2.5
 """Points on it one behind the other, on average, that do without both: the lowest beam on walls
 gives one or two, 2.3 in a corridor; ground gives three and more."""
 FEW_CELLS = 45
-"""Cells on the plane below which its height is doubtful. Whole scans that show the height have
-more; parts of a scan, up to 60 degrees wide, have fewer, or less than `MIN_COVERAGE` of the
-sectors."""
+"""Cells on the plane below which its height is doubtful: parts of a scan, up to 60 degrees wide,
+have fewer, or less than `MIN_COVERAGE` of the sectors."""
 UNDERCUT = 0.1
 """`GroundPlane.undercut` below which a plane of `FEW_CELLS` needs no `MIN_SUPPORT`: in jams it is
 0, on hills 0.6 and more."""
@@ -43,6 +42,14 @@ GOOD_SUPPORT, TALL = 0.9, 6.0
 OTHER_MIN_SUPPORT, OTHER_MIN_REACH = 0.5, 10.0
 """Support of a plane about another axis, and range that it reaches [m]: walls and ceilings of
 rooms seldom do."""
+LEAST_DEPRESSION, STEEP_DEPRESSION = 0.105, 0.2
+"""Angle to the plane at which a sensor sees the nearest of it, at least, and at which no vehicle's
+origin at its axles does [rad]: a sensor on its roof seems to see it at 0.05 to 0.16 from there."""
+LOW = 0.2
+"""Height of the sensor below which the plane that it is over may be a table top [m]."""
+ONE_ANGLE = 0.05
+"""Distance of the quartiles of the steepest angles to returns in all sectors, over the upper one,
+up to which a sensor is at the origin: 0.02 of a Mid-360, 0.1 and more from axles on hills."""
 CLEAR = 0.3
 """Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
 seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
@@ -94,11 +101,6 @@ class View(NamedTuple):
         return up
 
     @property
-    def levelled(self) -> FloatArray:
-        """Rotation (3, 3) as `turn`, to a frame in which the plane is level."""
-        return rotation(*angles_of(self.up))
-
-    @property
     def is_steep(self) -> bool:
         """Whether the plane is clearly tilted against the frame that it was fitted in."""
         return bool(self.plane.normal[2] < math.cos(STEEP))
@@ -110,14 +112,10 @@ class View(NamedTuple):
         return self.plane.support >= MIN_SUPPORT or has_none_below or bool(self.is_mirror)
 
     @property
-    def may_be_image(self) -> bool:
-        """Whether it may be a mirror image, as of the ceiling in a polished floor."""
-        return self.plane.overhung >= OVERHUNG or self.plane.support < MIN_SUPPORT
-
-    @property
     def is_dry(self) -> bool:
-        """Whether it is known to have no mirror images."""
-        return self.is_mirror is False and not self.may_be_image
+        """Whether it is known to have no mirror images, and to be none of a polished ceiling."""
+        is_no_image = self.plane.overhung < OVERHUNG and self.plane.support >= MIN_SUPPORT
+        return self.is_mirror is False and is_no_image
 
     @property
     def is_surface(self) -> bool:
@@ -142,8 +140,7 @@ class View(NamedTuple):
     @property
     def tells_tilt(self) -> bool:
         """Whether it is enough ground to tell the tilt."""
-        is_wide = self.plane.coverage >= MIN_COVERAGE
-        return is_wide and self.is_surface and self.is_well_supported
+        return self.is_surface and self.is_well_supported and self.plane.coverage >= MIN_COVERAGE
 
     @property
     def can_level(self) -> bool:
@@ -157,6 +154,16 @@ def is_ceiling(plane: GroundPlane, scan: Scan) -> bool:
         return False
     height = plane.below(*scan.xyz[scan.grid.r < FARTHEST].T.astype(np.float64))
     return bool(np.count_nonzero(height > CLEAR) <= np.count_nonzero(height < -CLEAR))
+
+
+def is_below_sensor(plane: GroundPlane, scan: Scan) -> bool:
+    """Whether a plane is seen as from a sensor at the origin: steeply, or by a cone of rays."""
+    if plane.height < LOW or not LEAST_DEPRESSION <= plane.depression < STEEP_DEPRESSION:
+        return plane.depression >= LEAST_DEPRESSION
+    c, steepest = scan.candidates, np.full(N_SECTORS, -np.inf)
+    np.maximum.at(steepest, c.segment * N_SECTORS // c.n_segments, np.arctan2(-c.z, c.r))
+    low, high = np.quantile(steepest[np.isfinite(steepest)], (0.25, 0.75))
+    return bool(high - low < ONE_ANGLE * high)
 
 
 def is_doubtful(below: View | None) -> bool:

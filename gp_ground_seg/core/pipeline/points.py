@@ -155,8 +155,7 @@ def without_box(
 @np.errstate(all='ignore')
 def objection_to_ranges(xyz: PointArray) -> str:
     """Return what is wrong where points (N, 3) are farther away than a sensor measures, or ''."""
-    x, y, z = (np.abs(xyz) > FARTHEST).T
-    is_beyond = x | y | z
+    is_beyond = (np.abs(xyz) > FARTHEST).any(axis=1)
     if not is_beyond.any():
         return ''
     is_beyond &= finite_points(xyz)

@@ -11,8 +11,8 @@ from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import FloatArray, PointArray, usual_errors
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, find_spec
 from gp_ground_seg.core.parameters.schema import AUTO
-from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.core.pipeline.ground_view import View, refusal
+from gp_ground_seg.core.pipeline.ground_plane import CLEAR_TILT, GroundPlane
+from gp_ground_seg.core.pipeline.ground_view import LOW, View, refusal
 from gp_ground_seg.core.pipeline.points import Direction, angles_of, rotate, rotation, rounded
 
 DEFAULT_HEIGHT = 1.73
@@ -21,8 +21,6 @@ NO_HEIGHT = (
     f'the scan does not show the ground near the sensor: sensor.height = {DEFAULT_HEIGHT:g} m is '
     'assumed; set it'
 )
-LOW = 0.2
-"""Height of the sensor below which the plane that it is over may be a table top [m]."""
 LOW_GROUND = (
     f'the ground seems to be less than {LOW:g} m below the sensor, and may be a table top: set '
     'sensor.height'
@@ -31,9 +29,6 @@ LITTLE_GROUND = (
     'the scan shows little ground near the sensor, and the height estimated from it may be wrong: '
     'set sensor.height'
 )
-CLEAR_TILT = 0.045
-"""Tilt from which roll and pitch that are auto level the scan [rad]: camber and a vehicle's own
-lean stay below it."""
 LEAST_COSINE = 0.1
 """Cosine of the tilt from which the sensor's z axis meets the ground."""
 HEIGHT_CONTRADICTION = 0.3
