@@ -86,9 +86,10 @@ def reachable(
     taken &= ~is_fall | (is_terrain[first] & is_terrain[second])
     is_reached = is_terrain & _reached(is_seed, first[taken], second[taken])
     is_own = allowed & (candidates.z < OWN)
-    stands |= hides(candidates.r, candidates.z, is_reached, growth) & ~(
-        _sees(is_own, candidates) | _reached(is_own, first[is_even], second[is_even])
-    )
+    number = np.append(0, np.cumsum(is_own))
+    sees_own = number[1:] > number[candidates.offsets[candidates.segment]]
+    leads = sees_own | _reached(is_own, first[is_even], second[is_even])
+    stands |= ~leads & hides(candidates.r, candidates.z, is_reached, growth)
     return is_reached, stands
 
 
@@ -96,14 +97,6 @@ def _reached(is_seed: BoolArray, first: IntArray, second: IntArray) -> BoolArray
     """Candidates that steps lead to from enough seeds, (C,)."""
     group = _groups(len(is_seed), first, second)
     result: BoolArray = (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
-    return result
-
-
-def _sees(is_own: BoolArray, candidates: Candidates) -> BoolArray:
-    """Whether the own level is seen before each candidate, or there, (C,)."""
-    number = np.append(0, np.cumsum(is_own))
-    first = candidates.offsets[candidates.segment]
-    result: BoolArray = number[1:] > number[first]
     return result
 
 
