@@ -192,6 +192,7 @@ CASES |= {
 # PLY.
 
 LE, BE = 'binary_little_endian', 'binary_big_endian'
+LISTS = ',list uchar int a,list uchar uchar b'
 FACES = 'element face 2,property list uchar int vertex_indices'
 FACE_BYTES = struct.pack('<B3iB4i', 3, 0, 1, 2, 4, 0, 1, 2, 3)
 
@@ -204,8 +205,16 @@ def ply(more='', body=None, form='ascii', before='', after='', kind='float'):
     return text.encode() + (text_of(XYZ) if body is None else body)
 
 
+LISTED = {
+    o: b''.join(struct.pack(f'{o}fffB{k}iBB', *v, k, *range(k), 1, 7) for k, v in enumerate(XYZ))
+    for o in '<>'
+}
 CASES |= {
-    'lists.ply': (ply(',list uchar int views', RAW, LE), 'list .* numbers only, no lists'),
+    'list_last.ply': (ply(LISTS, LISTED['<'], LE), 'x y z'),
+    'list_last_big.ply': (ply(LISTS, LISTED['>'], BE), 'x y z'),
+    'list_last_text.ply': (ply(',list uchar int a', with_ring(0, '1 5', 0, '2 4 7')), 'x y z'),
+    'list_between.ply': (ply(LISTS + ',uchar r', LISTED['<'], LE), 'numbers, and behind them'),
+    'list_cut.ply': (ply(LISTS, LISTED['<'][:-1], LE), 'truncated'),
     'faces_first.ply': (
         ply(form=LE, before=FACES, body=FACE_BYTES + RAW), 'elements face 2, vertex 4'
     ),

@@ -2,8 +2,7 @@
 
 The node runs in a second process and is sent clouds through ROS at several rates, in a namespace
 of a random name: frames of a KITTI_ROOT, or simulated scans of a sensor. Its CPU time is beside
-that of a call of Patchwork++ at the same rate. For its first minute, set NUMBA_CACHE_DIR to an
-empty folder; for a starved node, use taskset, and busy loops.
+that of Patchwork++ at the same rate. For its first minute, set NUMBA_CACHE_DIR to an empty folder.
 """
 
 import argparse
@@ -18,7 +17,6 @@ import pandas as pd
 from cli_runner import cpu_seconds
 
 from gp_ground_seg.cli.demo import FRAME_ID
-from gp_ground_seg.cli.options import progress
 from gp_ground_seg.data.bags import cloud_from_points, decode_cloud, encode_cloud, with_stamp
 from gp_ground_seg.data.point_cloud2 import stamp_of
 from gp_ground_seg.data.semantic_kitti import frames
@@ -28,11 +26,9 @@ from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 from gp_ground_seg.ros.loader import CHANGED
 from gp_ground_seg.ros.node_process import INPUT, OUTPUTS, NodeProcess, private_session
 
-SILENCE = 2.0
-"""Time without a cloud after which what is still missing is lost [s]."""
+SILENCE = 2.0  # time without a cloud after which what is still missing is lost [s]
 N_READ, N_SIMULATED = 30, 10  # different clouds
 N_SENT, N_PEER = 600, 100  # clouds at each rate, to the node and to Patchwork++
-IMU_PERIOD = 0.005  # [s]
 PERCENTILES = {50: 'p50 [ms]', 95: 'p95', 99: 'p99', 100: 'worst'}
 
 
@@ -53,7 +49,7 @@ class Probe:
         back[topic] = info.get('received_timestamp') or time.time_ns()
         self._last_news = time.monotonic()
 
-    def send(self, clouds, rate, on_sent):
+    def send(self, clouds, rate):
         """Send clouds at a rate [Hz]; return counts, and percentiles of the latency."""
         self._sent.clear()
         due = time.monotonic()
@@ -63,7 +59,6 @@ class Probe:
                 self._session.spin(left)
             self._sent[stamp_of(cloud.header)] = time.time_ns()
             self._publisher.publish(raw)
-            on_sent()
             due += 1.0 / rate
         self._last_news = time.monotonic()
         while time.monotonic() < self._last_news + SILENCE:
@@ -99,7 +94,7 @@ def cpu_of_peer(scans, rate):
 
 
 def send_orientations(session):
-    """Send what a level IMU does."""
+    """Send what a level IMU does, at 200 Hz."""
     from sensor_msgs.msg import Imu
 
     publisher, level = session.node.create_publisher(Imu, 'imu', 10), Imu()
@@ -109,7 +104,7 @@ def send_orientations(session):
         level.header.stamp = session.node.get_clock().now().to_msg()
         publisher.publish(level)
 
-    session.node.create_timer(IMU_PERIOD, send)
+    session.node.create_timer(0.005, send)
 
 
 def measure(scans, given):
@@ -127,12 +122,10 @@ def measure(scans, given):
             while not any(expected in line for line in node.log_lines()):
                 session.spin(0.1)
                 node.check()
-            if not given.at_once:  # DDS connects meanwhile
-                probe.send(itertools.islice(endless, 20), 10.0, lambda: None)
+            probe.send(itertools.islice(endless, 0 if given.at_once else 20), 10.0)  # DDS connects
             for rate in given.rates:
                 cpu = cpu_seconds(node.pid)
-                with progress(f'{rate:g} Hz')(total=N_SENT) as bar:
-                    found = probe.send(itertools.islice(endless, N_SENT), rate, bar.update)
+                found = probe.send(itertools.islice(endless, N_SENT), rate)
                 found['CPU [ms]'] = 1e3 * (cpu_seconds(node.pid) - cpu) / N_SENT
                 results.append({**found, 'Patchwork++ [ms]': 1e3 * cpu_of_peer(scans, rate)})
             node.check()
@@ -157,9 +150,7 @@ def main():
             simulate_scan(SCENES['urban'](1), SENSORS[given.sensor], np.random.default_rng(k), k)
             .points for k in range(N_SIMULATED)
         ]  # fmt: skip
-    n_points = sum(map(len, scans)) / len(scans)
-    source = given.root or f'simulated {given.sensor}'
-    print(f'{source}: {len(scans)} clouds of {n_points:.0f} points')
+    print(f'{len(scans)} clouds of {sum(map(len, scans)) / len(scans):.0f} points')
     print(pd.DataFrame(measure(scans, given)).round(1).to_string(index=False))
     print(machine_line(describe_environment(), 'numba'))
 

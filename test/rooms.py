@@ -19,3 +19,4 @@ HALL = room('hall', [(-8.0, -5.0), (12.0, -5.0), (12.0, 7.0), (-8.0, 7.0)], ceil
 ROOM, SMALL_ROOM = (
     room('room', [(-a, -a), (a, -a), (a, a), (-a, a)], ceiling=True) for a in (5.0, 4.5)
 )
+CORRIDOR = room('corridor', [(-20.0, -0.6), (20.0, -0.6), (20.0, 0.6), (-20.0, 0.6)])

@@ -6,12 +6,13 @@ text number by number, which is slow.
 Source: http://paulbourke.net/dataformats/ply/.
 """
 
+import logging
 import re
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.errors import PointCloudError, log_once
 from gp_ground_seg.data import clouds
 from gp_ground_seg.data.clouds import Cloud, Fields
 
@@ -22,14 +23,16 @@ _CODES = {
 _NAMES = {code: name for name, code in _CODES.items()}
 # int8, ..., of newer writers.
 _READABLE = {**_CODES, **{np.dtype(code).name: code for code in (*_NAMES, 'i8', 'u8')}}
-_ORDERS = {'ascii': '<', 'binary_little_endian': '<', 'binary_big_endian': '>'}
+_BIG = 'binary_big_endian'
+_FORMS = 'ascii', 'binary_little_endian', _BIG
+_Lists = list[tuple[int, int]]
+"""Bytes of the count, and of an item, of each list of a vertex."""
 
 
 def read_ply(data: bytes) -> tuple[Fields, list[str]]:
-    """Read the vertices of a file, and its comments.
+    """Read the vertices of a file, without lists behind their numbers, and its comments.
 
-    PointCloudError if it cannot be a PLY, if the vertices are not its first element, or if they
-    have lists.
+    PointCloudError if it cannot be a PLY, or if the vertices are not its first element.
     """
     lines, body = clouds.split_header(data, 'end_header')
     remarks = [line for line in lines if line.split()[0] in ('comment', 'obj_info')]
@@ -38,29 +41,54 @@ def read_ply(data: bytes) -> tuple[Fields, list[str]]:
     starts = [k for k, words in enumerate(entries) if words[0] == 'element']
     elements = ', '.join(' '.join(entries[k][1:]) for k in starts)
     vertices = re.match(r'vertex (\d+)(, |$)', elements, re.ASCII)
-    if lines[0].lower() != 'ply' or form not in _ORDERS or vertices is None:
+    if lines[0].lower() != 'ply' or form not in _FORMS or vertices is None:
         raise PointCloudError(
             'no PLY with a number of vertices as its first element: '
             f'format {form}, elements {elements or "none"}'
         )
     begin, end = [*starts, len(entries)][:2]
     properties = [words for words in entries[begin:end] if words[0] == 'property']
-    read = clouds.read_lines if form == 'ascii' else clouds.read_table
-    fields = read(body, _type_of(properties, _ORDERS[form]), int(vertices[1]))
-    return fields.astype(fields.dtype.newbyteorder('=')), remarks
+    dtype, lists = _types_of(properties)
+    if form == 'ascii':
+        return clouds.read_lines(body, dtype, int(vertices[1])), remarks
+    if lists:
+        order: Literal['big', 'little'] = 'big' if form == _BIG else 'little'
+        body = _without_lists(body, dtype.itemsize, lists, order, int(vertices[1]))
+    stored = dtype.newbyteorder('>' if form == _BIG else '<')
+    return clouds.read_table(body, stored, int(vertices[1])).astype(dtype), remarks
 
 
-def _type_of(properties: list[list[str]], order: str) -> np.dtype[Any]:
-    """Type of a vertex in a byte order, of the lines of its properties."""
-    names, codes = [], []
+def _types_of(properties: list[list[str]]) -> tuple[np.dtype[Any], _Lists]:
+    """Type of the numbers of a vertex, and its lists, of the lines of its properties."""
+    names, codes, lists = [], [], _Lists()
     for line in properties:
-        code = _READABLE.get(line[1].lower()) if len(line) == 3 else None
-        if code is None:
-            problem = 'cannot be read: a vertex has numbers only, no lists'
+        is_list = line[1] == 'list'
+        found = [_READABLE.get(word.lower(), '') for word in line[1 + is_list : -1]]
+        if len(found) != 1 + is_list or not all(found) or (lists and not is_list):
+            problem = 'cannot be read: a vertex has numbers, and behind them lists'
             raise PointCloudError(f'line {" ".join(line)!r} of its header {problem}')
-        names.append(line[2])
-        codes.append(f'{order}{code}')
-    return np.dtype(list(zip(clouds.distinct(names), codes, strict=True)))
+        if is_list:
+            lists.append((int(found[0][1:]), int(found[1][1:])))
+            log_once(logging.INFO, f'PLY: lists of the vertices are left out: {line[-1]}')
+        else:
+            names.append(line[2])
+            codes.append(found[0])
+    return np.dtype(list(zip(clouds.distinct(names), codes, strict=True))), lists
+
+
+def _without_lists(
+    data: bytes, n_bytes: int, lists: _Lists, order: Literal['big', 'little'], n_points: int
+) -> bytes:
+    """Rows of a body, each cut to its first `n_bytes`; only those that are there as a whole."""
+    rows, place = list[bytes](), 0
+    while len(rows) < n_points:
+        begin, place = place, place + n_bytes
+        for count, item in lists:
+            place += count + item * int.from_bytes(data[place : place + count], order)
+        if place > len(data):
+            break
+        rows.append(data[begin : begin + n_bytes])
+    return b''.join(rows)
 
 
 def encode_ply(cloud: Cloud) -> bytes:

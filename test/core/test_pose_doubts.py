@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from conftest import simulated
-from rooms import HALL, ROOM, SMALL_ROOM
+from rooms import CORRIDOR, HALL, ROOM, SMALL_ROOM
 from test_sensor_pose import (
     SEGMENTER,
     SENSORS,
@@ -236,6 +236,7 @@ NEAR = [
     # Floors under a ceiling, also the little that is seen of a small room, and among desks.
     *((HALL, *one, 0, 0.05) for one in ((VLP_16, 0.4), (OS1_128, 0.5), (HDL_64E, 1.73))),
     (SMALL_ROOM, simulation.SENSORS['mid-360'], 0.45, 0, 0.05),
+    (CORRIDOR, simulation.SENSORS['mid-360'], 0.4, 1, 0.05),
     (desks(2.4), dataclasses.replace(SMALL_OS1, elevations=UPWARDS), 0.95, 0, 0.05),
     # A narrow jetty is the ground; rails beside the sensor, and cars around, are not.
     (Scene('rails', JETTY, RAILS), simulation.SENSORS['mid-360'], 1.0, 0, 0.05),
