@@ -222,6 +222,7 @@ CASES |= {
     'int64.ply': (ply(',int64 t', rows(np.arange(4)), LE), 'x y z t'),
     'numbered_types.ply': (ply(',uint16 t', with_ring(1, 2, 3, 4), kind='float32'), 'x y z t'),
     'unknown_type.ply': (ply(',quad t', RAW, LE), "line 'property quad t' of its header"),
+    'no_type.ply': (ply(','), "line 'property' of its header cannot be read"),
     'float_as_integer.ply': (ply(',uchar t', with_ring('0.0', 1, 2, 'nan')), 'x y z t'),
     'name_twice.ply': (ply(',ushort a,ushort a', rows(RING, RING), LE), 'x y z a a_2'),
     'nan_of_windows.ply': (

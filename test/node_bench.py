@@ -68,12 +68,11 @@ class Probe:
             for stamp, sent in self._sent.items()
             if len(back := self._back.get(stamp, {})) == len(OUTPUTS)
         ]
-        n_sent = len(self._sent)
         percents = np.percentile(latency or [np.nan], [*PERCENTILES])
         return {
             'rate [Hz]': rate,
-            'sent': n_sent,
-            'lost': n_sent - len(latency),
+            'sent': len(self._sent),
+            'lost': len(self._sent) - len(latency),
             **dict(zip(PERCENTILES.values(), percents, strict=True)),
         }
 

@@ -10,7 +10,7 @@ import os
 import textwrap
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import chain, islice
+from itertools import islice
 from numbers import Real
 from pathlib import Path
 from time import perf_counter
@@ -274,8 +274,7 @@ class GroundSegmenter:
         if is_turned or config.grid != self._config.grid:
             scan = backend.build_grid(pose.level(about), config)
         if objection == LOWER_ENDS and pose.is_height_default:
-            # No candidate is left.
-            scan = scan._replace(candidates=scan.candidates.where(scan.candidates.r < 0.0))
+            scan = scan._replace(candidates=scan.candidates.where(scan.candidates.r < 0.0))  # none
         images = find_mirror_images(scan, pose, view)
         if len(images.points) > 0:
             scan = images.left_out(backend.build_grid(images.raised(scan.xyz), config))
@@ -330,7 +329,9 @@ class GroundSegmenter:
         """Best plane of a scan that may be ground, or without one the best that is no ceiling."""
         views = self._views(scan, turn, max_tilt)
         first = next(views, None)
-        return next((v for v in chain([first], views) if v is None or v.tells_height), first)
+        if first is None or first.tells_height:
+            return first
+        return next((view for view in views if view.tells_height), first)
 
     def _views(
         self, scan: Scan, turn: FloatArray = UPRIGHT, max_tilt: float = MAX_TILT

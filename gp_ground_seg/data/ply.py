@@ -23,10 +23,11 @@ _CODES = {
 _NAMES = {code: name for name, code in _CODES.items()}
 # int8, ..., of newer writers.
 _READABLE = {**_CODES, **{np.dtype(code).name: code for code in (*_NAMES, 'i8', 'u8')}}
-_BIG = 'binary_big_endian'
-_FORMS = 'ascii', 'binary_little_endian', _BIG
-_Lists = list[tuple[int, int]]
-"""Bytes of the count, and of an item, of each list of a vertex."""
+_Order = Literal['little', 'big']
+_ORDERS: dict[str, _Order] = {
+    'ascii': 'little', 'binary_little_endian': 'little', 'binary_big_endian': 'big',
+}  # fmt: skip
+_Lists = list[tuple[int, int]]  # bytes of the count, and of an item, of each list of a vertex
 
 
 def read_ply(data: bytes) -> tuple[Fields, list[str]]:
@@ -41,28 +42,26 @@ def read_ply(data: bytes) -> tuple[Fields, list[str]]:
     starts = [k for k, words in enumerate(entries) if words[0] == 'element']
     elements = ', '.join(' '.join(entries[k][1:]) for k in starts)
     vertices = re.match(r'vertex (\d+)(, |$)', elements, re.ASCII)
-    if lines[0].lower() != 'ply' or form not in _FORMS or vertices is None:
+    if lines[0].lower() != 'ply' or form not in _ORDERS or vertices is None:
         raise PointCloudError(
             'no PLY with a number of vertices as its first element: '
             f'format {form}, elements {elements or "none"}'
         )
     begin, end = [*starts, len(entries)][:2]
     properties = [words for words in entries[begin:end] if words[0] == 'property']
-    dtype, lists = _types_of(properties)
+    (dtype, lists), order, n_points = _types_of(properties), _ORDERS[form], int(vertices[1])
     if form == 'ascii':
-        return clouds.read_lines(body, dtype, int(vertices[1])), remarks
+        return clouds.read_lines(body, dtype, n_points), remarks
     if lists:
-        order: Literal['big', 'little'] = 'big' if form == _BIG else 'little'
-        body = _without_lists(body, dtype.itemsize, lists, order, int(vertices[1]))
-    stored = dtype.newbyteorder('>' if form == _BIG else '<')
-    return clouds.read_table(body, stored, int(vertices[1])).astype(dtype), remarks
+        body = _without_lists(body, dtype.itemsize, lists, order, n_points)
+    return clouds.read_table(body, dtype.newbyteorder(order), n_points).astype(dtype), remarks
 
 
 def _types_of(properties: list[list[str]]) -> tuple[np.dtype[Any], _Lists]:
     """Type of the numbers of a vertex, and its lists, of the lines of its properties."""
     names, codes, lists = [], [], _Lists()
     for line in properties:
-        is_list = line[1] == 'list'
+        is_list = line[1:2] == ['list']
         found = [_READABLE.get(word.lower(), '') for word in line[1 + is_list : -1]]
         if len(found) != 1 + is_list or not all(found) or (lists and not is_list):
             problem = 'cannot be read: a vertex has numbers, and behind them lists'
@@ -77,7 +76,7 @@ def _types_of(properties: list[list[str]]) -> tuple[np.dtype[Any], _Lists]:
 
 
 def _without_lists(
-    data: bytes, n_bytes: int, lists: _Lists, order: Literal['big', 'little'], n_points: int
+    data: bytes, n_bytes: int, lists: _Lists, order: _Order, n_points: int
 ) -> bytes:
     """Rows of a body, each cut to its first `n_bytes`; only those that are there as a whole."""
     rows, place = list[bytes](), 0
