@@ -42,6 +42,7 @@ class _Columns(NamedTuple):
     length_scale: FloatArray  # (size,) float32 [m]
     height: FloatArray  # (size,) prediction about the prior mean [m]
     variance: FloatArray  # (size,) its variance [m^2]
+    process: FloatArray  # (size,) float32 covariances of the process with the last inlier [m^2]
     z: FloatArray  # (n,) heights of the candidates about the prior mean [m]
     noise: FloatArray  # (n,) variances of the noise with which they are observed [m^2]
     neighbour_height: FloatArray  # (n,) evidence at the candidates [m]
@@ -81,6 +82,7 @@ def _make_columns(frame: Frame, step: int, n_knots: int, precision: Any) -> _Col
         np.empty(width, np.float32),
         of_columns[1],
         of_columns[2],
+        np.empty(width, np.float32),
         table[0],
         table[1],
         table[2],
@@ -305,37 +307,40 @@ def _observe(
     i: int, n_inliers: int, near: int, size: int, prior: _Prior, columns: _Columns
 ) -> None:
     """Condition the columns from `near` on on candidate i: one more row of `whitened`."""
-    r, length_scale, whitened = columns.r, columns.length_scale, columns.whitened
-    r_i, l_i, sill, zero = r[i], length_scale[i], np.float32(prior.sill), np.float32(0.0)
-    number = r.dtype.type
+    # Arrays are taken from `columns` each time: references to those with a name are counted.
+    r_i, l_i = columns.r[i], columns.length_scale[i]
+    sill, zero, number = np.float32(prior.sill), np.float32(0.0), columns.r.dtype.type
     slope, sixth = number(prior.slope), number(prior.sixth)
     # Unsigned indices: see `numerics`.
     start, end, own, n = np.uintp(near), np.uintp(size), np.uintp(i), np.uintp(n_inliers)
     one, two, three, four = np.uintp(1), np.uintp(2), np.uintp(3), np.uintp(4)
     # Prior covariance of column i with the others (paper, eq. 8): that of the process always is of
-    # single precision, by differences of ranges in their own.
+    # single precision, by differences of ranges in their own. A loop of one precision is faster.
     for j in range(start, end):
-        process = paciorek(np.float32(r_i - r[j]), l_i, zero, length_scale[j], sill)
-        whitened[n, j] = process + line_covariance(r_i, r[j], slope, sixth)
+        columns.process[j] = r_i - columns.r[j]
+    for j in range(start, end):
+        columns.process[j] = paciorek(columns.process[j], l_i, zero, columns.length_scale[j], sill)
+    for j in range(start, end):
+        walked = line_covariance(r_i, columns.r[j], slope, sixth)
+        columns.whitened[n, j] = columns.process[j] + walked
     # Subtract the projection on the rows before, four rows at a time, so that the
     # new row is read and written once for all of them.
     for k in range(np.uintp(0), n & ~three, four):
-        w_0, w_1 = whitened[k, own], whitened[k + one, own]
-        w_2, w_3 = whitened[k + two, own], whitened[k + three, own]
+        w_0, w_1 = columns.whitened[k, own], columns.whitened[k + one, own]
+        w_2, w_3 = columns.whitened[k + two, own], columns.whitened[k + three, own]
         for j in range(start, end):
-            known = w_0 * whitened[k, j] + w_1 * whitened[k + one, j]
-            known = known + w_2 * whitened[k + two, j] + w_3 * whitened[k + three, j]
-            whitened[n, j] -= known
+            known = w_0 * columns.whitened[k, j] + w_1 * columns.whitened[k + one, j]
+            known = known + w_2 * columns.whitened[k + two, j]
+            columns.whitened[n, j] -= known + w_3 * columns.whitened[k + three, j]
     for k in range(n & ~three, n):
-        w_0 = whitened[k, own]
+        w_0 = columns.whitened[k, own]
         for j in range(start, end):
-            whitened[n, j] -= w_0 * whitened[k, j]
-    height, variance = columns.height, columns.variance
-    precision = 1.0 / (max(variance[i], 0.0) + columns.noise[i])
+            columns.whitened[n, j] -= w_0 * columns.whitened[k, j]
+    precision = 1.0 / (max(columns.variance[i], 0.0) + columns.noise[i])
     scale = number(math.sqrt(precision))
-    innovation = number(columns.z[i] - height[i]) * scale
+    innovation = number(columns.z[i] - columns.height[i]) * scale
     for j in range(start, end):
-        value = whitened[n, j] * scale
-        whitened[n, j] = value
-        height[j] += value * innovation
-        variance[j] -= value * value
+        value = columns.whitened[n, j] * scale
+        columns.whitened[n, j] = value
+        columns.height[j] += value * innovation
+        columns.variance[j] -= value * value
