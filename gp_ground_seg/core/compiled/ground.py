@@ -222,12 +222,12 @@ def _grow(
     columns: _Columns,
 ) -> None:
     """Let the new ones join, and those that then fit, until none does."""
-    first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
-    inlier = found.inlier[first:stop]
-    for i in range(stop - first):
+    first = frame.candidates.offsets[m]
+    n = frame.candidates.offsets[m + 1] - first
+    for i in range(n):
         columns.r[i] = frame.candidates.r[first + i]
         columns.length_scale[i] = found.log_length_scale[first + i]
-    size = _lay_out(stop - first, prior, columns)
+    size = _lay_out(n, prior, columns)
     for a in range(n_new):
         i = columns.new[a]
         if model.by_roughness and frame.in_face[first + i]:
@@ -239,14 +239,14 @@ def _grow(
     while n_new > 0 or n_inliers == 0:
         for a in range(n_new):
             i = columns.new[a]
-            inlier[i] = True
-            while done < stop - first and inlier[done]:
+            found.inlier[first + i] = True
+            while done < n and found.inlier[first + done]:
                 done += 1
             # The columns before are not needed any more.
             _observe(i, n_inliers, min(i, done) & -LANES, size, prior, columns)
             n_inliers += 1
         n_new = _find_joining(
-            frame, first, inlier, done, n_inliers > 0, prior.noise, model, columns
+            frame, m, found.inlier, done, n_inliers > 0, prior.noise, model, columns
         )
         if n_new == 0:
             break
@@ -255,7 +255,7 @@ def _grow(
 @jit(part=True)
 def _find_joining(
     frame: Frame,
-    first: int,
+    m: int,
     inlier: BoolArray,
     done: int,
     has_inliers: bool,
@@ -264,30 +264,30 @@ def _find_joining(
     columns: _Columns,
 ) -> int:
     """Set the new ones to those from `done` on that now join; return their number."""
-    r, z, lines, n_new, last = frame.candidates.r, columns.z, frame.lines, 0, done - 1
-    growth = model.growth
-    for i in range(done, len(inlier)):
-        c, in_face = first + i, frame.in_face[first + i]
-        if inlier[i]:
+    first, growth, n_new, last = frame.candidates.offsets[m], model.growth, 0, done - 1
+    for i in range(done, frame.candidates.offsets[m + 1] - first):
+        c, in_face, z = first + i, frame.in_face[first + i], columns.z[i]
+        if inlier[c]:
             last = i
             continue
         # Before anything has joined, only the evidence of neighbours decides.
         if not has_inliers and columns.neighbour_precision[i] == 0.0:
             continue
         height, variance = _predict(i, columns)
-        joins, falls, is_shown = fits(z[i], height, variance, noise, growth), False, False
+        joins, falls, is_shown = fits(z, height, variance, noise, growth), False, False
         if last >= 0:
-            rise, distance = z[i] - z[last], r[c] - r[first + last]
+            rise, r = z - columns.z[last], frame.candidates.r[first + last]
+            distance = frame.candidates.r[c] - r
             walkable = is_walkable(rise, distance, growth.max_slope)
             if walkable and not in_face and not columns.above[i]:
-                line = lines.line[first + last]
-                extent = r[first + last] - r[lines.start[line]]
-                before = slope_before(lines.slope[line], extent, distance, growth)
+                line = frame.lines.line[first + last]
+                extent = r - frame.candidates.r[frame.lines.start[line]]
+                before = slope_before(frame.lines.slope[line], extent, distance, growth)
                 is_shown, falls = carries_on(rise, distance, frame.onward[c], before), rise <= 0.0
             elif not joins:
                 last = -1  # it stands on the ground, which does not go on behind it
         if joins and model.by_roughness and not is_shown:
-            columns.noise[i] = noise_in_doubt(z[i], height, variance, columns.noise[i], in_face)
+            columns.noise[i] = noise_in_doubt(z, height, variance, columns.noise[i], in_face)
         joins |= is_shown or falls
         if joins:
             columns.new[n_new] = i
