@@ -109,10 +109,6 @@ def grow_inliers(
     for m in range(0, len(frame.candidates.offsets) - 1, step):
         n_new = _begin(frame, m, prior.noise, reach, from_neighbours, found, columns)
         _grow(frame, m, n_new, prior, model, found, columns)
-        first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
-        for c in range(first, stop):
-            certain = noise_among(found.alike[c], prior.noise)
-            found.doubt[c] = columns.noise[c - first] - certain
 
 
 @compiled_form(ground.regress)
@@ -138,8 +134,7 @@ def regress(
             if found.inlier[c]:
                 r[n], length_scale[n] = candidates.r[c], found.log_length_scale[c]
                 columns.z[n] = candidates.z[c] - frame.prior_mean
-                columns.noise[n] = noise_among(found.alike[c], prior.noise)
-                columns.noise[n] += found.doubt[c]
+                columns.noise[n] = noise_among(found.alike[c], prior.noise) + found.doubt[c]
                 n += 1
         if n == 0:
             continue
@@ -250,6 +245,10 @@ def _grow(
         )
         if n_new == 0:
             break
+    for i in range(n):
+        found.doubt[first + i] = columns.noise[i] - noise_among(
+            found.alike[first + i], prior.noise
+        )
 
 
 @jit(part=True)
@@ -288,8 +287,7 @@ def _find_joining(
                 last = -1  # it stands on the ground, which does not go on behind it
         if joins and model.by_roughness and not is_shown:
             columns.noise[i] = noise_in_doubt(z, height, variance, columns.noise[i], in_face)
-        joins |= is_shown or falls
-        if joins:
+        if joins or is_shown or falls:
             columns.new[n_new] = i
             n_new += 1
     return n_new
@@ -323,8 +321,7 @@ def _observe(
     for j in range(start, end):
         walked = line_covariance(r_i, columns.r[j], slope, sixth)
         columns.whitened[n, j] = columns.process[j] + walked
-    # Subtract the projection on the rows before, four rows at a time, so that the
-    # new row is read and written once for all of them.
+    # Subtract the projection on the rows before: the new one is read and written once for four.
     for k in range(np.uintp(0), n & ~three, four):
         w_0, w_1 = columns.whitened[k, own], columns.whitened[k + one, own]
         w_2, w_3 = columns.whitened[k + two, own], columns.whitened[k + three, own]
