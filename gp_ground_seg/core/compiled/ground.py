@@ -245,10 +245,8 @@ def _grow(
         )
         if n_new == 0:
             break
-    for i in range(n):
-        found.doubt[first + i] = columns.noise[i] - noise_among(
-            found.alike[first + i], prior.noise
-        )
+    for c in range(first, first + n):
+        found.doubt[c] = columns.noise[c - first] - noise_among(found.alike[c], prior.noise)
 
 
 @jit(part=True)
