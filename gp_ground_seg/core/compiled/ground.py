@@ -42,6 +42,7 @@ class _Columns(NamedTuple):
     length_scale: FloatArray  # (size,) float32 [m]
     height: FloatArray  # (size,) prediction about the prior mean [m]
     variance: FloatArray  # (size,) its variance [m^2]
+    process: FloatArray  # (size,) float32 covariances of the process with the last inlier [m^2]
     z: FloatArray  # (n,) heights of the candidates about the prior mean [m]
     noise: FloatArray  # (n,) variances of the noise with which they are observed [m^2]
     neighbour_height: FloatArray  # (n,) evidence at the candidates [m]
@@ -81,6 +82,7 @@ def _make_columns(frame: Frame, step: int, n_knots: int, precision: Any) -> _Col
         np.empty(width, np.float32),
         of_columns[1],
         of_columns[2],
+        np.empty(width, np.float32),
         table[0],
         table[1],
         table[2],
@@ -107,10 +109,6 @@ def grow_inliers(
     for m in range(0, len(frame.candidates.offsets) - 1, step):
         n_new = _begin(frame, m, prior.noise, reach, from_neighbours, found, columns)
         _grow(frame, m, n_new, prior, model, found, columns)
-        first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
-        for c in range(first, stop):
-            certain = noise_among(found.alike[c], prior.noise)
-            found.doubt[c] = columns.noise[c - first] - certain
 
 
 @compiled_form(ground.regress)
@@ -136,8 +134,7 @@ def regress(
             if found.inlier[c]:
                 r[n], length_scale[n] = candidates.r[c], found.log_length_scale[c]
                 columns.z[n] = candidates.z[c] - frame.prior_mean
-                columns.noise[n] = noise_among(found.alike[c], prior.noise)
-                columns.noise[n] += found.doubt[c]
+                columns.noise[n] = noise_among(found.alike[c], prior.noise) + found.doubt[c]
                 n += 1
         if n == 0:
             continue
@@ -220,12 +217,12 @@ def _grow(
     columns: _Columns,
 ) -> None:
     """Let the new ones join, and those that then fit, until none does."""
-    first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
-    inlier = found.inlier[first:stop]
-    for i in range(stop - first):
+    first = frame.candidates.offsets[m]
+    n = frame.candidates.offsets[m + 1] - first
+    for i in range(n):
         columns.r[i] = frame.candidates.r[first + i]
         columns.length_scale[i] = found.log_length_scale[first + i]
-    size = _lay_out(stop - first, prior, columns)
+    size = _lay_out(n, prior, columns)
     for a in range(n_new):
         i = columns.new[a]
         if model.by_roughness and frame.in_face[first + i]:
@@ -237,23 +234,25 @@ def _grow(
     while n_new > 0 or n_inliers == 0:
         for a in range(n_new):
             i = columns.new[a]
-            inlier[i] = True
-            while done < stop - first and inlier[done]:
+            found.inlier[first + i] = True
+            while done < n and found.inlier[first + done]:
                 done += 1
             # The columns before are not needed any more.
             _observe(i, n_inliers, min(i, done) & -LANES, size, prior, columns)
             n_inliers += 1
         n_new = _find_joining(
-            frame, first, inlier, done, n_inliers > 0, prior.noise, model, columns
+            frame, m, found.inlier, done, n_inliers > 0, prior.noise, model, columns
         )
         if n_new == 0:
             break
+    for c in range(first, first + n):
+        found.doubt[c] = columns.noise[c - first] - noise_among(found.alike[c], prior.noise)
 
 
 @jit(part=True)
 def _find_joining(
     frame: Frame,
-    first: int,
+    m: int,
     inlier: BoolArray,
     done: int,
     has_inliers: bool,
@@ -262,32 +261,31 @@ def _find_joining(
     columns: _Columns,
 ) -> int:
     """Set the new ones to those from `done` on that now join; return their number."""
-    r, z, lines, n_new, last = frame.candidates.r, columns.z, frame.lines, 0, done - 1
-    growth = model.growth
-    for i in range(done, len(inlier)):
-        c, in_face = first + i, frame.in_face[first + i]
-        if inlier[i]:
+    first, growth, n_new, last = frame.candidates.offsets[m], model.growth, 0, done - 1
+    for i in range(done, frame.candidates.offsets[m + 1] - first):
+        c, in_face, z = first + i, frame.in_face[first + i], columns.z[i]
+        if inlier[c]:
             last = i
             continue
         # Before anything has joined, only the evidence of neighbours decides.
         if not has_inliers and columns.neighbour_precision[i] == 0.0:
             continue
         height, variance = _predict(i, columns)
-        joins, falls, is_shown = fits(z[i], height, variance, noise, growth), False, False
+        joins, falls, is_shown = fits(z, height, variance, noise, growth), False, False
         if last >= 0:
-            rise, distance = z[i] - z[last], r[c] - r[first + last]
+            rise, r = z - columns.z[last], frame.candidates.r[first + last]
+            distance = frame.candidates.r[c] - r
             walkable = is_walkable(rise, distance, growth.max_slope)
             if walkable and not in_face and not columns.above[i]:
-                line = lines.line[first + last]
-                extent = r[first + last] - r[lines.start[line]]
-                before = slope_before(lines.slope[line], extent, distance, growth)
+                line = frame.lines.line[first + last]
+                extent = r - frame.candidates.r[frame.lines.start[line]]
+                before = slope_before(frame.lines.slope[line], extent, distance, growth)
                 is_shown, falls = carries_on(rise, distance, frame.onward[c], before), rise <= 0.0
             elif not joins:
                 last = -1  # it stands on the ground, which does not go on behind it
         if joins and model.by_roughness and not is_shown:
-            columns.noise[i] = noise_in_doubt(z[i], height, variance, columns.noise[i], in_face)
-        joins |= is_shown or falls
-        if joins:
+            columns.noise[i] = noise_in_doubt(z, height, variance, columns.noise[i], in_face)
+        if joins or is_shown or falls:
             columns.new[n_new] = i
             n_new += 1
     return n_new
@@ -305,37 +303,39 @@ def _observe(
     i: int, n_inliers: int, near: int, size: int, prior: _Prior, columns: _Columns
 ) -> None:
     """Condition the columns from `near` on on candidate i: one more row of `whitened`."""
-    r, length_scale, whitened = columns.r, columns.length_scale, columns.whitened
-    r_i, l_i, sill, zero = r[i], length_scale[i], np.float32(prior.sill), np.float32(0.0)
-    number = r.dtype.type
+    # Arrays are taken from `columns` each time: references to those with a name are counted.
+    r_i, l_i = columns.r[i], columns.length_scale[i]
+    sill, zero, number = np.float32(prior.sill), np.float32(0.0), columns.r.dtype.type
     slope, sixth = number(prior.slope), number(prior.sixth)
     # Unsigned indices: see `numerics`.
     start, end, own, n = np.uintp(near), np.uintp(size), np.uintp(i), np.uintp(n_inliers)
     one, two, three, four = np.uintp(1), np.uintp(2), np.uintp(3), np.uintp(4)
     # Prior covariance of column i with the others (paper, eq. 8): that of the process always is of
-    # single precision, by differences of ranges in their own.
+    # single precision, by differences of ranges in their own. A loop of one precision is faster.
     for j in range(start, end):
-        process = paciorek(np.float32(r_i - r[j]), l_i, zero, length_scale[j], sill)
-        whitened[n, j] = process + line_covariance(r_i, r[j], slope, sixth)
-    # Subtract the projection on the rows before, four rows at a time, so that the
-    # new row is read and written once for all of them.
+        columns.process[j] = r_i - columns.r[j]
+    for j in range(start, end):
+        columns.process[j] = paciorek(columns.process[j], l_i, zero, columns.length_scale[j], sill)
+    for j in range(start, end):
+        walked = line_covariance(r_i, columns.r[j], slope, sixth)
+        columns.whitened[n, j] = columns.process[j] + walked
+    # Subtract the projection on the rows before: the new one is read and written once for four.
     for k in range(np.uintp(0), n & ~three, four):
-        w_0, w_1 = whitened[k, own], whitened[k + one, own]
-        w_2, w_3 = whitened[k + two, own], whitened[k + three, own]
+        w_0, w_1 = columns.whitened[k, own], columns.whitened[k + one, own]
+        w_2, w_3 = columns.whitened[k + two, own], columns.whitened[k + three, own]
         for j in range(start, end):
-            known = w_0 * whitened[k, j] + w_1 * whitened[k + one, j]
-            known = known + w_2 * whitened[k + two, j] + w_3 * whitened[k + three, j]
-            whitened[n, j] -= known
+            known = w_0 * columns.whitened[k, j] + w_1 * columns.whitened[k + one, j]
+            known = known + w_2 * columns.whitened[k + two, j]
+            columns.whitened[n, j] -= known + w_3 * columns.whitened[k + three, j]
     for k in range(n & ~three, n):
-        w_0 = whitened[k, own]
+        w_0 = columns.whitened[k, own]
         for j in range(start, end):
-            whitened[n, j] -= w_0 * whitened[k, j]
-    height, variance = columns.height, columns.variance
-    precision = 1.0 / (max(variance[i], 0.0) + columns.noise[i])
+            columns.whitened[n, j] -= w_0 * columns.whitened[k, j]
+    precision = 1.0 / (max(columns.variance[i], 0.0) + columns.noise[i])
     scale = number(math.sqrt(precision))
-    innovation = number(columns.z[i] - height[i]) * scale
+    innovation = number(columns.z[i] - columns.height[i]) * scale
     for j in range(start, end):
-        value = whitened[n, j] * scale
-        whitened[n, j] = value
-        height[j] += value * innovation
-        variance[j] -= value * value
+        value = columns.whitened[n, j] * scale
+        columns.whitened[n, j] = value
+        columns.height[j] += value * innovation
+        columns.variance[j] -= value * value

@@ -297,8 +297,7 @@ def _on_slope(
     rise, distance, line = z - z[before], r - r[before], lines.line[before]
     walkable = is_walkable(rise, distance, growth.max_slope) & ~stops
     is_open = (before >= first) & (last(~chosen & ~fitting & ~walkable) < before) & walkable
-    extent = r[before] - r[lines.start[line]]
-    slope = slope_before(lines.slope[line], extent, distance, growth)
+    slope = slope_before(lines.slope[line], r[before] - r[lines.start[line]], distance, growth)
     is_shown = is_open & carries_on(rise, distance, frame.onward, slope)
     return is_shown | (is_open & (rise <= 0.0)), is_shown
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, Values
-from gp_ground_seg.core.jit import shared
+from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import ObservationConfig
 
 try:
@@ -69,7 +69,8 @@ def line_covariance(r_a: Values, r_b: Values, slope: Values, sixth: Values) -> V
     `sixth` is ``drift^2 / 6`` [1/m], where ``drift^2`` is the variance that the slope gains over a
     metre.
     """
-    near, far = np.minimum(r_a, r_b), np.maximum(r_a, r_b)
+    is_nearer = r_a < r_b
+    near, far = choose(is_nearer, r_a, r_b), choose(is_nearer, r_b, r_a)
     return near * (slope * far + sixth * near * (far + far + far - near))
 
 
