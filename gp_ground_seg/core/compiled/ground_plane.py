@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray
+from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.core.jit import compiled_form, jit
-from gp_ground_seg.core.pipeline import ground_plane, lowest_points
+from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import (
     Plane,
     fit_plane,
@@ -16,52 +16,7 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     support_by,
     tukey_weight,
 )
-from gp_ground_seg.core.pipeline.lowest_points import (
-    MAX_Z,
-    N_CELLS,
-    N_RINGS,
-    N_SECTORS,
-    N_TOGETHER,
-    RING_EDGES,
-    LowestPoints,
-    tolerance_at,
-)
-
-
-@compiled_form(lowest_points.lowest_of_cells)
-def lowest_of_cells(candidates: Candidates) -> tuple[IntArray, IntArray, IntArray, BoolArray]:
-    """Occupied cells, the lowest candidate of each, the one that counts, whether it is alone."""
-    r, z, offsets = candidates.r, candidates.z, candidates.offsets
-    n_segments = len(offsets) - 1
-    cell, stop = np.full(len(r), N_CELLS), np.zeros(N_CELLS + 1, dtype=np.int64)
-    for m in range(n_segments):
-        for c in range(offsets[m], offsets[m + 1]):
-            if RING_EDGES[0] <= r[c] < RING_EDGES[-1] and abs(z[c]) < MAX_Z:
-                ring = np.searchsorted(RING_EDGES, r[c], side='right') - 1
-                cell[c] = m * N_SECTORS // n_segments * N_RINGS + ring
-                stop[cell[c] + 1] += 1
-    stop = np.cumsum(stop)
-    start, order = stop.copy(), np.empty(stop[N_CELLS], dtype=np.int64)
-    # A cell's candidates go behind those that are not higher.
-    for c in range(len(r)):
-        own = cell[c]
-        if own < N_CELLS:
-            k = stop[own]
-            stop[own] += 1
-            while k > start[own] and z[order[k - 1]] > z[c]:
-                order[k] = order[k - 1]
-                k -= 1
-            order[k] = c
-    occupied = np.flatnonzero(stop > start)
-    first = order[start[occupied]]
-    lowest, is_alone = first.copy(), np.ones(len(first), dtype=np.bool_)
-    for i in range(len(occupied)):
-        for k in range(start[occupied[i]], stop[occupied[i]] - N_TOGETHER + 1):
-            low = order[k]
-            if z[order[k + N_TOGETHER - 1]] - z[low] <= tolerance_at(r[low]):
-                lowest[i], is_alone[i] = low, False
-                break
-    return occupied, first, lowest, is_alone
+from gp_ground_seg.core.pipeline.lowest_points import LowestPoints
 
 
 @compiled_form(ground_plane.supports_of)

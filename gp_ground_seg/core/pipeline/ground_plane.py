@@ -149,8 +149,8 @@ def fit_plane(candidates: Candidates, max_slope: float, is_left: BoolArray) -> A
     weight = np.where(is_left[cells.cell], cells.weight, 0.0)
     first, score, _ = best_of(planes, cells, weight, 0.0)
     plane, other_height = own_level(cells, first, score, max_slope)
-    is_on = np.abs(distance(cells.x, cells.y, cells.z, plane) * cells.inverse) <= 1.0
-    is_left[cells.cell[is_on]] = False
+    d = distance(cells.x, cells.y, cells.z, plane) * cells.inverse
+    is_left[cells.cell[np.abs(d) <= 1.0]] = False
     return described(cells, plane, other_height)
 
 
@@ -181,11 +181,10 @@ def own_level(
     refine(x, y, z, inverse, planes[:1], max_slope, N_REFINEMENTS)
     if CLEAR_TILT < math.hypot(planes[0, 1], planes[0, 2]) < STRAIGHT:
         # Low shelves on one side tilt a plane, without more support than a level one has.
-        zero = np.zeros_like(x)
-        refine(zero, zero, z, inverse, planes[1:], max_slope, N_REFINEMENTS)
+        refine(0.0 * x, 0.0 * y, z, inverse, planes[1:], max_slope, N_REFINEMENTS)
         planes[0] = best_of(planes, cells, cells.weight, 0.0)[0]
-    plane = planes[0, 0], planes[0, 1], planes[0, 2]
-    return plane, other[0] if score > 0.0 else math.inf
+    other_height = other[0] if score > 0.0 else math.inf
+    return (planes[0, 0], planes[0, 1], planes[0, 2]), other_height
 
 
 @shared
@@ -199,17 +198,12 @@ def hypotheses(cells: LowestPoints, max_slope: float) -> FloatArray:
         return np.zeros((0, 3))
     level = np.zeros((n_level, 3))
     level[:, 0] = -cells.z[np.arange(n_level) * n // n_level]
-    which = (SPREAD * n).astype(np.int64)
-    tilted = possible(planes_through(cells, which[:, 0], which[:, 1], which[:, 2]), max_slope)
+    tilted = planes_through(cells, (SPREAD * n).astype(np.int64).T)
+    level = level[is_possible(level.T, max_slope)]
+    tilted = tilted[is_possible(tilted.T, max_slope)]
     refine(cells.x, cells.y, cells.z, cells.inverse, tilted, max_slope, N_FIRST)
-    planes = np.concatenate((possible(level, max_slope), tilted))
-    return np.floor(planes / GRAIN + 0.5) * GRAIN
-
-
-@shared
-def possible(planes: FloatArray, max_slope: float) -> FloatArray:
-    """Those of the planes (P, 3) that can be the ground."""
-    return planes[is_possible((planes[:, 0], planes[:, 1], planes[:, 2]), max_slope)]
+    planes = np.concatenate((level, tilted))
+    return np.asarray(np.floor(planes / GRAIN + 0.5) * GRAIN)
 
 
 @shared
@@ -230,8 +224,9 @@ def other_levels(best: Plane, cells: LowestPoints, is_left: BoolArray) -> FloatA
 
 
 @shared
-def planes_through(cells: LowestPoints, i: IntArray, j: IntArray, k: IntArray) -> FloatArray:
-    """Planes through three points each, (P, 3); NaN if they are on a line."""
+def planes_through(cells: LowestPoints, points: IntArray) -> FloatArray:
+    """Planes through three `points` each, (3, P), as (P, 3); NaN if they are on a line."""
+    i, j, k = points[0], points[1], points[2]
     x1, y1, z1 = cells.x[j] - cells.x[i], cells.y[j] - cells.y[i], cells.z[j] - cells.z[i]
     x2, y2, z2 = cells.x[k] - cells.x[i], cells.y[k] - cells.y[i], cells.z[k] - cells.z[i]
     area = x1 * y2 - x2 * y1
@@ -244,7 +239,7 @@ def planes_through(cells: LowestPoints, i: IntArray, j: IntArray, k: IntArray) -
 @shared
 def is_possible(plane: Any, max_slope: float) -> Any:
     """Whether a plane can be the ground."""
-    height, slope_x, slope_y = plane
+    height, slope_x, slope_y = plane[0], plane[1], plane[2]
     is_gentle = slope_x * slope_x + slope_y * slope_y <= max_slope * max_slope
     return is_gentle & (height >= MIN_HEIGHT) & (height <= MAX_HEIGHT)
 
@@ -271,13 +266,13 @@ def asideness(cells: LowestPoints, own: Plane, other: Plane) -> float:
         nearest, nearest_other = min(nearest, reach), min(nearest_other, reach_other)
     is_outside = nearest < min(nearest_other, 0.0)
     between, whole = cells.weight[is_between].sum(), cells.weight[is_other].sum()
-    return between / max(whole, 1.0) + (1.0 if is_outside else 0.0)
+    return float(between / max(whole, 1.0) + is_outside)
 
 
 @shared
 def reach_of(along: FloatArray) -> float:
     """How far points reach in a direction, but `STRAY` of them."""
-    return np.sort(along)[math.ceil((1.0 - STRAY) * (len(along) - 1))]
+    return float(np.sort(along)[math.ceil((1.0 - STRAY) * (len(along) - 1))])
 
 
 @shared
@@ -376,7 +371,7 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     crossing = crossing_of(cells.r[is_below], height[is_below], plane)
     crossed = sector * N_RINGS + np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
     counts = (crossing < reach[sector]) & ~is_seen[crossed]
-    return refutation_by(crossing[counts]).sum()
+    return float(refutation_by(crossing[counts]).sum())
 
 
 def refine(
@@ -453,8 +448,7 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> Any:
     coverage = np.count_nonzero(is_new(sector[is_on])) / N_SECTORS
     depression = np.sort(np.arctan2(height - d, r))[many]
     overhung = np.count_nonzero(is_over) / np.count_nonzero(is_first)
-    undercut = np.count_nonzero(is_below) / n
     return (
         *plane, height - lift, most / len(cells.z), coverage, np.sort(r)[many], depression,
-        drop[many] - drop[few], overhung, n, undercut, other_height,
+        drop[many] - drop[few], overhung, n, np.count_nonzero(is_below) / n, other_height,
     )  # fmt: skip
