@@ -60,9 +60,8 @@ def test_backends_agree_on_the_score_of_a_plane(seed, share):
     rng = np.random.default_rng(seed)
     cells = ground_plane.lowest_points(random_candidates(seed, 60, 30, share))
     planes = np.column_stack([rng.uniform(-1.0, 2.5, 20), *rng.normal(0.0, 0.05, (2, 20))])
-    supports, theirs = (
-        module.supports_of(planes, cells, cells.weight) for module in (ground_plane, compiled)
-    )
+    scored = planes, cells, cells.weight
+    supports, theirs = (module.supports_of(*scored) for module in (ground_plane, compiled))
     np.testing.assert_allclose(theirs, supports, rtol=1e-12)
     refutations = [ground_plane.refutation_of(tuple(plane), cells) for plane in planes.tolist()]
     # The plane with the best score is found without the refutation of each.
