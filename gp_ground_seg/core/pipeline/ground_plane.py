@@ -351,7 +351,6 @@ def refutation_by(crossing: Values) -> Values:
     return np.floor(REFUTATION * RESOLUTION * nearness(crossing))
 
 
-@shared
 def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     """Weight of the rays that cross a plane where it should have stopped them; a whole number.
 

@@ -54,34 +54,34 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     It is the lowest that has `N_TOGETHER` - 1 more within its tolerance above it; where there is
     none, the lowest. Of equally low ones the first candidate comes first.
     """
-    r, z, end = candidates.r, candidates.z, candidates.offsets[1:]
-    there, own, n = candidates.offsets.copy(), np.empty(len(r), np.int64), 0
-    found, is_alone = np.empty((3, N_CELLS), np.int64), np.ones(N_CELLS, np.bool_)
-    first = -(-np.arange(N_SECTORS + 1) * len(end) // N_SECTORS)
-    for cell in range(N_CELLS):
-        sector, stop, k = cell // N_RINGS, RING_EDGES[cell % N_RINGS + 1], 0
-        # Each segment of the sector goes on where the ring before has ended.
-        for m in range(first[sector], first[sector + 1]):
-            while there[m] < end[m] and r[there[m]] < stop:
-                c, place = there[m], k
-                there[m] += 1
-                if r[c] >= RING_EDGES[0] and abs(z[c]) < MAX_Z:
-                    while place > 0 and z[own[place - 1]] > z[c]:
-                        own[place] = own[place - 1]
-                        place -= 1
-                    own[place] = c
-                    k += 1
-        if k > 0:
-            found[0, n], found[1, n], found[2, n] = cell, own[0], own[0]
-            for i in range(k - N_TOGETHER + 1):
-                if z[own[i + N_TOGETHER - 1]] - z[own[i]] <= tolerance_at(r[own[i]]):
-                    found[2, n], is_alone[n] = own[i], False
-                    break
-            n += 1
-    lowest, lowest_z = found[2, :n], z[found[1, :n]]
-    x, y, r, z = candidates.x[lowest], candidates.y[lowest], r[lowest], z[lowest]
-    inverse, weight = 1.0 / tolerance_at(r), np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
-    return LowestPoints(x, y, z, r, inverse, weight, found[0, :n], lowest_z, is_alone[:n])
+    cell, first, lowest, is_alone = lowest_of_cells(candidates)
+    x, y, r = candidates.x[lowest], candidates.y[lowest], candidates.r[lowest]
+    z, lowest_z = candidates.z[lowest], candidates.z[first]
+    weight = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
+    return LowestPoints(x, y, z, r, 1.0 / tolerance_at(r), weight, cell, lowest_z, is_alone)
+
+
+def lowest_of_cells(candidates: Candidates) -> tuple[IntArray, IntArray, IntArray, BoolArray]:
+    """Occupied cells, indices of the lowest candidate of each and of the one that counts.
+
+    The last is whether that lies alone.
+    """
+    r, z = candidates.r, candidates.z
+    near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
+    ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
+    cell = (candidates.segment[near] * N_SECTORS // candidates.n_segments) * N_RINGS + ring
+    # By cell, then by height, as one number: heights add less than half of one.
+    order = np.argsort(cell + z[near] / (4.0 * MAX_Z), kind='stable')
+    near, cell = near[order], cell[order]
+    k = N_TOGETHER - 1
+    low, high = near[:-k], near[k:]
+    is_together = (cell[:-k] == cell[k:]) & (z[high] - z[low] <= tolerance_at(r[low]))
+    first, together = np.flatnonzero(is_new(cell)), np.flatnonzero(is_together)
+    together = together[is_new(cell[together])]
+    lowest, is_alone = near[first], np.ones(len(first), dtype=np.bool_)
+    place = np.searchsorted(cell[first], cell[together])
+    lowest[place], is_alone[place] = near[together], False
+    return cell[first], near[first], lowest, is_alone
 
 
 @shared
