@@ -313,15 +313,14 @@ class GroundSegmenter:
         """View of the ground about z or another axis; that `below` z is doubtful."""
         sample = xyz[:: len(xyz) // ENOUGH_POINTS + 1]
 
-        def look(turn: FloatArray) -> View | None:
-            return self._look(self._backend.build_grid(rotate(sample, turn), self._config), turn)
+        def look(turn: FloatArray, again: bool = True) -> View | None:
+            view = self._look(self._backend.build_grid(rotate(sample, turn), self._config), turn)
+            # Again in a frame in which the plane is level.
+            return look(rotation(*angles_of(view.up)), False) if view and again else view
 
         if below is not None and below.is_steep:
-            below = look(rotation(*angles_of(below.up))) or below
-        if not is_doubtful(below):
-            return below
-        first = map(look, OTHER_AXES)
-        return clearest(below, [look(rotation(*angles_of(v.up))) if v else None for v in first])
+            below = look(UPRIGHT) or below
+        return clearest(below, map(look, OTHER_AXES)) if is_doubtful(below) else below
 
     def _look(
         self, scan: Scan, turn: FloatArray = UPRIGHT, max_tilt: float = MAX_TILT

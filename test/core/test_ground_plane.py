@@ -60,20 +60,20 @@ def test_backends_agree_on_the_score_of_a_plane(seed, share):
     rng = np.random.default_rng(seed)
     cells = ground_plane.lowest_points(random_candidates(seed, 60, 30, share))
     planes = np.column_stack([rng.uniform(-1.0, 2.5, 20), *rng.normal(0.0, 0.05, (2, 20))])
-    supports, theirs = (module.supports_of(planes, cells) for module in (ground_plane, compiled))
+    scored = planes, cells, cells.weight
+    supports, theirs = (module.supports_of(*scored) for module in (ground_plane, compiled))
     np.testing.assert_allclose(theirs, supports, rtol=1e-12)
     refutations = [ground_plane.refutation_of(tuple(plane), cells) for plane in planes.tolist()]
-    assert [compiled.refutation_of(tuple(p), cells) for p in planes.tolist()] == refutations
     # The plane with the best score is found without the refutation of each.
     scores = np.square(supports) / np.maximum(np.add(supports, refutations), 1.0)
-    best, score, support = ground_plane.best_of(planes, cells, 0.0)
+    best, score, support = ground_plane.best_of(planes, cells, cells.weight, 0.0)
     if score == 0.0:
         assert max(supports) == 0.0
         return
     k = planes.tolist().index(list(best))
     np.testing.assert_allclose((score, support), (scores.max(), supports[k]), rtol=1e-12)
     assert scores[k] == pytest.approx(scores.max(), rel=1e-12)
-    assert ground_plane.best_of(planes, cells, score)[1] == 0.0
+    assert ground_plane.best_of(planes, cells, cells.weight, score)[1] == 0.0
 
 
 @pytest.mark.parametrize('backend', BACKENDS, ids=lambda b: b.name)

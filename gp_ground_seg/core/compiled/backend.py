@@ -24,6 +24,7 @@ from gp_ground_seg.core.gp.learning import fit_theta, learn_frame
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import numbers_of
+from gp_ground_seg.core.pipeline.ground_plane import find_planes
 from gp_ground_seg.core.pipeline.labels import (
     depth_of_ground,
     highest_ground,
@@ -42,7 +43,7 @@ class NumbaBackend:
     """The stages of `gp_ground_seg.core.backend.NumpyBackend`, compiled."""
 
     name = 'numba'
-    find_planes = staticmethod(ground_plane.find_planes)
+    find_planes = staticmethod(partial(find_planes, fit=ground_plane.fit))
     extract_lines = staticmethod(partial(find_lines, trace_lines=jit(entry=True)(trace)))
     learn_frame = staticmethod(partial(learn_frame, fit=jit(entry=True)(fit_theta)))
     estimate_surface = staticmethod(partial(estimate_surface, fit=jit(entry=True)(fit_surfaces)))

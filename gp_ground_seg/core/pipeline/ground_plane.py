@@ -114,15 +114,23 @@ class GroundPlane(NamedTuple):
         return normal / math.sqrt(self.slope_x**2 + self.slope_y**2 + 1.0)
 
 
-def find_planes(candidates: Candidates, max_slope: float) -> Iterator[GroundPlane]:
+def find_planes(
+    candidates: Candidates, max_slope: float, fit: Callable[..., Any] | None = None
+) -> Iterator[GroundPlane]:
     """Yield planes that many of the lowest points lie on and few rays cross, the best first.
 
     Consensus (Fischler & Bolles, CACM 1981) over planes through a fixed, evenly spread
     choice of three cells and level planes through one, then a redescending M-estimator
-    (Beaton & Tukey, Technometrics 1974) from the best of them. `max_slope` is that of the
-    steepest plane to look for, as rise per metre.
+    (Beaton & Tukey, Technometrics 1974) from the best of them. Each after the first is by the
+    points that are left. `max_slope` is that of the steepest plane to look for, as rise per
+    metre; `fit` is `fit_plane`, compiled.
     """
-    return planes_of(lowest_points(candidates), max_slope, Loops(best_of, refine))
+    is_left = np.ones(N_CELLS, dtype=np.bool_)
+    while True:
+        found = GroundPlane(*(fit or fit_plane)(candidates, max_slope, is_left))
+        if found.n_support == 0:
+            return
+        yield found
 
 
 STEPS = 1.2207440846057596 ** -np.arange(1.0, 4.0)
@@ -131,105 +139,112 @@ SPREAD = (0.5 + np.arange(1, N_TRIPLES + 1)[:, None] * STEPS) % 1.0
 the recurrence R3, whose steps are powers of the root of x^4 = x + 1 (Roberts, 2018)."""
 
 
-class Loops(NamedTuple):
-    """Loops over the points: those below, or compiled."""
+def fit_plane(candidates: Candidates, max_slope: float, is_left: BoolArray) -> Any:
+    """Fields of the best `GroundPlane`, without the last; `n_support` is 0 if there is none.
 
-    best_of: Callable[[FloatArray, LowestPoints, float], tuple[Plane, float, float]]
-    refine: Callable[[LowestPoints, FloatArray, float, int], None]
-
-
-def planes_of(cells: LowestPoints, max_slope: float, loops: Loops) -> Iterator[GroundPlane]:
-    """Yield planes as `find_planes` does; each after the first by the points that are left."""
-    if len(cells.z) < MIN_CELLS:
-        return
-    planes, left = hypotheses(cells, max_slope, loops), cells
-    while True:
-        best = loops.best_of(planes, left, 0.0)
-        found = described(cells, *own_level(cells, best, max_slope, loops))
-        if found is None:
-            return
-        yield found
-        is_on = np.abs(found.below(cells.x, cells.y, cells.z) * cells.inverse) <= 1.0
-        left = left._replace(weight=np.where(is_on, 0.0, left.weight))
+    It is chosen by the cells that are left, (N_CELLS,), of which those on it are then taken.
+    """
+    cells = lowest_points(candidates)
+    planes = hypotheses(cells, max_slope)
+    weight = np.where(is_left[cells.cell], cells.weight, 0.0)
+    first, score, _ = best_of(planes, cells, weight, 0.0)
+    plane, other_height = own_level(cells, first, score, max_slope)
+    d = distance(cells.x, cells.y, cells.z, plane) * cells.inverse
+    is_left[cells.cell[np.abs(d) <= 1.0]] = False
+    return described(cells, plane, other_height)
 
 
+@shared
 def own_level(
-    cells: LowestPoints, first: tuple[Plane, float, float], max_slope: float, loops: Loops
+    cells: LowestPoints, best: Plane, best_score: float, max_slope: float
 ) -> tuple[Plane, float]:
     """Plane of the level that the robot stands on, and height of another level or infinity.
 
-    It is the plane with the best score, `first` as `best_of` returns it, or a parallel one that is
-    not refuted and goes on to where the robot stands, as the best one does not. Points that are
-    nearer to a tight other level do not refine it; the crests of waves are not tight.
+    It is the plane with the best score, or a parallel one that is not refuted and goes on to where
+    the robot stands, as the best one does not. Points that are nearer to a tight other level do
+    not refine it; the crests of waves are not tight.
     """
-    (best, best_score, _), own = first, cells
+    x, y, z, inverse = cells.x, cells.y, cells.z, cells.inverse
     # Points of the best plane, and those that lie alone, are of no other level.
-    d = np.abs(distance(cells.x, cells.y, cells.z, best))
-    is_left = (d * cells.inverse > 1.0) & ~cells.is_alone
-    left = cells._replace(weight=np.where(is_left, cells.weight, 0.0))
+    d = np.abs(distance(x, y, z, best))
+    is_left = (d * inverse > 1.0) & ~cells.is_alone
+    weight = np.where(is_left, cells.weight, 0.0)
     others = other_levels(best, cells, is_left)
-    other, score, support = loops.best_of(others, left, OTHER_SHARE * best_score)
-    from_other = np.abs(distance(cells.x, cells.y, cells.z, other))
-    whole = left.weight[from_other * cells.inverse <= 1.0].sum()
+    other, score, support = best_of(others, cells, weight, OTHER_SHARE * best_score)
+    from_other = np.abs(distance(x, y, z, other))
+    whole = weight[from_other * inverse <= 1.0].sum()
     if support > TIGHT * RESOLUTION * whole:
         if asideness(cells, other, best) < OWN * asideness(cells, best, other):
             best, other, d, from_other = other, best, from_other, d
-        own = cells._replace(inverse=np.where(d <= from_other, cells.inverse, 0.0))
+        inverse = np.where(d <= from_other, inverse, 0.0)
     planes = np.array([best, (best[0], 0.0, 0.0)])
-    loops.refine(own, planes[:1], max_slope, N_REFINEMENTS)
+    refine(x, y, z, inverse, planes[:1], max_slope, N_REFINEMENTS)
     if CLEAR_TILT < math.hypot(planes[0, 1], planes[0, 2]) < STRAIGHT:
         # Low shelves on one side tilt a plane, without more support than a level one has.
-        own = own._replace(x=np.zeros_like(own.x), y=np.zeros_like(own.y))
-        loops.refine(own, planes[1:], max_slope, N_REFINEMENTS)
-        planes[0] = loops.best_of(planes, cells, 0.0)[0]
-    return (planes[0, 0], planes[0, 1], planes[0, 2]), math.inf if score == 0.0 else other[0]
+        refine(0.0 * x, 0.0 * y, z, inverse, planes[1:], max_slope, N_REFINEMENTS)
+        planes[0] = best_of(planes, cells, cells.weight, 0.0)[0]
+    other_height = other[0] if score > 0.0 else math.inf
+    return (planes[0, 0], planes[0, 1], planes[0, 2]), other_height
 
 
-def hypotheses(cells: LowestPoints, max_slope: float, loops: Loops) -> FloatArray:
+@shared
+def hypotheses(cells: LowestPoints, max_slope: float) -> FloatArray:
     """Level planes through one of the points, and refined ones through three, (P, 3).
 
-    Where little ground is seen, no three points of it may be on its plane.
+    Where little ground is seen, no three points of it may be on its plane. Few points have none.
     """
     n, n_level = len(cells.z), min(len(cells.z), N_LEVEL)
-    level = np.multiply.outer(-cells.z[np.arange(n_level) * n // n_level], (1.0, 0.0, 0.0))
-    tilted = planes_through(cells, *(SPREAD * n).astype(np.int64).T)
-    level, tilted = (planes[is_possible(planes.T, max_slope)] for planes in (level, tilted))
-    loops.refine(cells, tilted, max_slope, N_FIRST)
-    return np.asarray(np.floor(np.concatenate([level, tilted]) / GRAIN + 0.5) * GRAIN)
+    if n < MIN_CELLS:
+        return np.zeros((0, 3))
+    level = np.zeros((n_level, 3))
+    level[:, 0] = -cells.z[np.arange(n_level) * n // n_level]
+    tilted = planes_through(cells, (SPREAD * n).astype(np.int64).T)
+    level = level[is_possible(level.T, max_slope)]
+    tilted = tilted[is_possible(tilted.T, max_slope)]
+    refine(cells.x, cells.y, cells.z, cells.inverse, tilted, max_slope, N_FIRST)
+    planes = np.concatenate((level, tilted))
+    return np.asarray(np.floor(planes / GRAIN + 0.5) * GRAIN)
 
 
+@shared
 def other_levels(best: Plane, cells: LowestPoints, is_left: BoolArray) -> FloatArray:
     """Planes through some of the points, clearly over or below the best one, (P, 3).
 
     They are parallel to it, or level if its tilt may come from lying on several levels.
     """
-    tilt = (0.0, 0.0) if math.hypot(best[1], best[2]) < STRAIGHT else best[1:]
-    height = -distance(cells.x, cells.y, cells.z, (0.0, *tilt))[is_left]
+    slope_x, slope_y = best[1], best[2]
+    if math.hypot(slope_x, slope_y) < STRAIGHT:
+        slope_x, slope_y = 0.0, 0.0
+    height = -distance(cells.x, cells.y, cells.z, (0.0, slope_x, slope_y))[is_left]
     height = height[:: 1 + len(height) // N_LEVEL]
     may_be = (np.abs(height - best[0]) > APART) & (height > min(best[0], 0.0))
     height = height[may_be & (height <= MAX_HEIGHT)]
-    return np.column_stack([height, np.full((len(height), 2), tilt)])
+    tilt = np.ones_like(height)
+    return np.column_stack((height, slope_x * tilt, slope_y * tilt))
 
 
-def planes_through(cells: LowestPoints, i: IntArray, j: IntArray, k: IntArray) -> FloatArray:
-    """Planes through three points each, (P, 3); NaN if they are on a line."""
+@shared
+def planes_through(cells: LowestPoints, points: IntArray) -> FloatArray:
+    """Planes through three `points` each, (3, P), as (P, 3); NaN if they are on a line."""
+    i, j, k = points[0], points[1], points[2]
     x1, y1, z1 = cells.x[j] - cells.x[i], cells.y[j] - cells.y[i], cells.z[j] - cells.z[i]
     x2, y2, z2 = cells.x[k] - cells.x[i], cells.y[k] - cells.y[i], cells.z[k] - cells.z[i]
     area = x1 * y2 - x2 * y1
     area[area == 0.0] = np.nan
     slope_x, slope_y = (z1 * y2 - z2 * y1) / area, (x1 * z2 - x2 * z1) / area
     height = slope_x * cells.x[i] + slope_y * cells.y[i] - cells.z[i]
-    return np.column_stack([height, slope_x, slope_y])
+    return np.column_stack((height, slope_x, slope_y))
 
 
 @shared
 def is_possible(plane: Any, max_slope: float) -> Any:
     """Whether a plane can be the ground."""
-    height, slope_x, slope_y = plane
+    height, slope_x, slope_y = plane[0], plane[1], plane[2]
     is_gentle = slope_x * slope_x + slope_y * slope_y <= max_slope * max_slope
     return is_gentle & (height >= MIN_HEIGHT) & (height <= MAX_HEIGHT)
 
 
+@shared
 def asideness(cells: LowestPoints, own: Plane, other: Plane) -> float:
     """How little a level goes on to where the robot stands: 0 to 2.
 
@@ -243,25 +258,34 @@ def asideness(cells: LowestPoints, own: Plane, other: Plane) -> float:
     is_own, is_other = (d <= 1.0) & (d <= from_other), (from_other <= 1.0) & (from_other < d)
     if not (is_own.any() and is_other.any()):
         return 1.0
-    along = np.multiply.outer(np.cos(AZIMUTHS), x) + np.multiply.outer(np.sin(AZIMUTHS), y)
-    reach, reach_other = (
-        np.quantile(along[:, mask], 1.0 - STRAY, axis=1, method='higher')
-        for mask in (is_own, is_other)
-    )
-    is_between = (along[:, is_other] <= np.maximum(reach, 0.0)[:, None]).all(axis=0)
-    weight = cells.weight[is_other]
-    is_outside = reach.min() < min(reach_other.min(), 0.0)
-    return float(weight[is_between].sum() / max(weight.sum(), 1.0) + is_outside)
+    is_between, nearest, nearest_other = is_other.copy(), math.inf, math.inf
+    for azimuth in AZIMUTHS:
+        along = math.cos(azimuth) * x + math.sin(azimuth) * y
+        reach, reach_other = reach_of(along[is_own]), reach_of(along[is_other])
+        is_between &= along <= max(reach, 0.0)
+        nearest, nearest_other = min(nearest, reach), min(nearest_other, reach_other)
+    is_outside = nearest < min(nearest_other, 0.0)
+    between, whole = cells.weight[is_between].sum(), cells.weight[is_other].sum()
+    return float(between / max(whole, 1.0) + is_outside)
 
 
-def best_of(planes: FloatArray, cells: LowestPoints, least: float) -> tuple[Plane, float, float]:
+@shared
+def reach_of(along: FloatArray) -> float:
+    """How far points reach in a direction, but `STRAY` of them."""
+    return float(np.sort(along)[math.ceil((1.0 - STRAY) * (len(along) - 1))])
+
+
+@shared
+def best_of(
+    planes: FloatArray, cells: LowestPoints, weight: FloatArray, least: float
+) -> tuple[Plane, float, float]:
     """Plane with the best score above `least`, its score, and its support: NaN, 0, 0 without one.
 
     The score is the support, times the share of it in all evidence. It is at most the support, so
     that few planes need their refutation.
     """
     best, best_score, best_support = (math.nan, math.nan, math.nan), 0.0, 0.0
-    left = supports_of(planes, cells)
+    left = supports_of(planes, cells, weight)
     while len(left) > 0:
         p = np.argmax(left)
         support = left[p]
@@ -275,10 +299,10 @@ def best_of(planes: FloatArray, cells: LowestPoints, least: float) -> tuple[Plan
     return best, best_score, best_support
 
 
-def supports_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
+def supports_of(planes: FloatArray, cells: LowestPoints, weight: FloatArray) -> FloatArray:
     """Support of planes (P, 3) by the points near them, (P,)."""
     plane: Any = planes.T[:, :, None]
-    support = support_by(cells.x, cells.y, cells.z, cells.inverse, cells.weight, plane)
+    support = support_by(cells.x, cells.y, cells.z, cells.inverse, weight, plane)
     supports: FloatArray = levelness(planes[:, 1], planes[:, 2]) * support.sum(axis=1)
     return supports
 
@@ -349,15 +373,17 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     return float(refutation_by(crossing[counts]).sum())
 
 
-def refine(cells: LowestPoints, planes: FloatArray, max_slope: float, n_steps: int) -> None:
+def refine(
+    x: FloatArray, y: FloatArray, z: FloatArray, inverse: FloatArray,
+    planes: FloatArray, max_slope: float, n_steps: int,
+) -> None:  # fmt: skip
     """Weighted least squares with Tukey's weights of the plane before, again and again.
 
     Of `planes`, (P, 3), one that drifts off to a plane that cannot be the ground stays as it is.
     """
-    x, y, z = cells.x, cells.y, cells.z
-    plane = planes.T
+    plane: Any = planes.T
     for _ in range(n_steps):
-        weight = tukey_weight(x, y, z, cells.inverse, plane[:, :, None])
+        weight = tukey_weight(x, y, z, inverse, plane[:, :, None])
         along_x, along_y = weight * x, weight * y
         flat = weight.sum(axis=1), weight @ x, weight @ y
         square = along_x @ x, along_x @ y, along_y @ y
@@ -398,8 +424,9 @@ def solve_plane(moments: Any, plane: Any) -> tuple[Values, Values, Values]:
     return choose(has_points, slope_x * mx + slope_y * my - mz, height), slope_x, slope_y
 
 
-def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundPlane | None:
-    """Measure how well a plane is seen; None if no cell lies on it."""
+@shared
+def described(cells: LowestPoints, plane: Plane, other_height: float) -> Any:
+    """Fields of a `GroundPlane` that say how well it is seen."""
     height, sector, inverse = plane[0], cells.cell // N_RINGS, cells.inverse
     d, is_first = distance(cells.x, cells.y, cells.z, plane), is_new(sector)
     is_over = (d * inverse > CLEARLY_OFF) & (cells.z < 0.0) & is_first
@@ -408,27 +435,19 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> GroundP
     is_off, lowest = np.abs(d * inverse) > 1.0, distance(cells.x, cells.y, cells.lowest_z, plane)
     d, z = np.where(is_off, lowest, d), np.where(is_off, cells.lowest_z, cells.z)
     is_on = np.abs(d * inverse) <= 1.0
-    n = int(np.count_nonzero(is_on))
+    n = np.count_nonzero(is_on)
     if n == 0:
-        return None
+        return *plane, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0.0, other_height
     other = distance(cells.x, cells.y, z, (other_height, plane[1], plane[2]))
-    most = max(n, int(np.count_nonzero(np.abs(other * inverse) <= 1.0)))
+    most = max(n, np.count_nonzero(np.abs(other * inverse) <= 1.0))
     d, z, r = d[is_on], z[is_on], cells.r[is_on]
     few, many, near = n // 10, 9 * n // 10, d[r < NEAR]
     drop = np.sort(np.arctan2(-z, r))
-    lift = float(np.sort(near)[len(near) // 2]) if len(near) >= ENOUGH_NEAR else 0.0
-    return GroundPlane(
-        height=height,
-        slope_x=plane[1],
-        slope_y=plane[2],
-        near_height=height - lift,
-        support=most / len(cells.z),
-        coverage=np.count_nonzero(is_new(sector[is_on])) / N_SECTORS,
-        reach=float(np.sort(r)[many]),
-        depression=float(np.sort(np.arctan2(height - d, r))[many]),
-        spread=float(drop[many] - drop[few]),
-        overhung=np.count_nonzero(is_over) / np.count_nonzero(is_first),
-        n_support=n,
-        undercut=np.count_nonzero(is_below) / n,
-        other_height=other_height,
-    )
+    lift = np.sort(near)[len(near) // 2] if len(near) >= ENOUGH_NEAR else 0.0
+    coverage = np.count_nonzero(is_new(sector[is_on])) / N_SECTORS
+    depression = np.sort(np.arctan2(height - d, r))[many]
+    overhung = np.count_nonzero(is_over) / np.count_nonzero(is_first)
+    return (
+        *plane, height - lift, most / len(cells.z), coverage, np.sort(r)[many], depression,
+        drop[many] - drop[few], overhung, n, np.count_nonzero(is_below) / n, other_height,
+    )  # fmt: skip
