@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import FloatArray, Scan, as_index
+from gp_ground_seg.core.frame import FloatArray, Scan
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.lowest_points import FARTHEST, N_SECTORS, tolerance_at
 from gp_ground_seg.core.pipeline.points import angles_of, rotation
@@ -54,23 +54,22 @@ CLEAR = 0.3
 """Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
 seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
 
-COLUMN = 0.2, 0.6
-"""Heights over the plane between which a column is looked for over what lies on it [m]."""
-COLUMNS, COLUMNS_REACH = 0.55, 20.0
-"""Share of the candidates on a plane, up to this range [m], with a column over them, from which
-they are lower ends, unless there is a floor: of whole scans outdoors the most was 0.37, of cut
-ones mostly 0.6 to 1."""
-BEFORE = 0.1
-"""Distance from which a return before a column is of the floor before it [m]."""
-FLOOR_SCATTER, ROUGH_FLOOR = 0.025, 0.18
-"""Distance of the quartiles of the heights of all candidates on the plane, or of those without a
-column, up to which they lie on a floor [m]: 0.003 to 0.02 in crowded rooms and corridors, 0.03 to
-0.15 where the ground was cut away; and how much more it may be where all are without a column:
-rough paths between hedges have 0.05 where a third are."""
-CUT_TILT = 0.08
-"""Tilt [rad] from which a plane is not that at which ground was cut away."""
-FLOOR_SHARE = 0.1
-"""Least share of the candidates without a column that may show a floor by themselves."""
+CUT_TILT, CUT_REACH = 0.08, 20.0
+"""Tilt [rad] up to which, and range up to which points are on a plane at which all was cut away
+[m]."""
+EDGE = 0.15
+"""Height of such a plane over the lowest candidate, at most [m]: of uncut scans outdoors 0.2 to 30
+but on even ground. With few beams things end as much higher than the cut."""
+LAYERS, LEAST_LOWEST = (0.01, 0.05, 0.1, 0.2), 10
+"""Heights over the lowest candidate of layers of returns [m]: what ends at a cut has about as many
+at all heights; least number in the first layer."""
+LOWEST_SHARE, LAYER_SHARES = 0.025, (0.1, 0.7)
+"""Least share of the third layer that is in the first: cut clouds have 0.036 to 0.33, uneven
+ground 0 to 0.02. Shares of the third in the second, and of the fourth in the third: cut clouds
+mostly have 0.11 to 0.7, level ground up to 0.04 or from 0.75 on."""
+MOST_FLAT = 0.7
+"""Share of the cells on the plane, of those with several returns, that are no higher than the
+third layer, from which it is ground: roads with a gutter have 0.96, cut clouds 0 to 0.65."""
 LOWER_ENDS = (
     'the lowest returns are the lower ends of objects: the ground is not seen, or was cut away '
     'before, by a crop box or a pass-through filter'
@@ -209,29 +208,23 @@ def objection_to_ground(scan: Scan, view: View | None) -> str:
 
 
 def _shows_lower_ends(plane: GroundPlane, scan: Scan) -> bool:
-    """Whether most of what lies on a plane is lower ends of columns, and the rest is no floor."""
-    if plane.normal[2] < math.cos(CUT_TILT):
+    """Whether things end at a plane: they have as many returns at all heights over it."""
+    c = scan.candidates
+    lowest = c.z.min()
+    if -plane.height - lowest > EDGE or plane.normal[2] < math.cos(CUT_TILT):
         return False
-    candidates, tiles = scan.candidates, scan.tiles
-    height = plane.below(candidates.x, candidates.y, candidates.z)
-    tolerance = np.where(candidates.r < COLUMNS_REACH, tolerance_at(candidates.r), 0.0)
-    is_near, (low, high) = np.abs(height) < tolerance, COLUMN
-    height, tile, r = height[is_near], as_index(candidates.tile[is_near]), candidates.r[is_near]
-    enough = COLUMNS * len(tile)
-    if np.count_nonzero((tiles.extremes[:, 1] - tiles.extremes[:, 0])[tile] > low) <= enough:
+    z = scan.xyz[scan.grid.inside, 2]
+    first, *layers = (np.count_nonzero(z < lowest + layer) for layer in LAYERS)
+    shares = layers[0] / layers[1], layers[1] / layers[2]
+    least, most = LAYER_SHARES
+    is_edge = first >= max(LEAST_LOWEST, LOWEST_SHARE * layers[1])
+    if not is_edge or min(shares) < least or max(shares) > most:
         return False
-    over = plane.below(*scan.xyz.T)
-    in_column = (over > low) & (over < high) & (tiles.tile >= 0)
-    column_r = np.full(len(tiles.extremes), np.inf)
-    np.minimum.at(column_r, tiles.tile[in_column], scan.grid.r[in_column])
-    # Floor before a column is nearer than what stands on it.
-    alone = height[r < column_r[tile] - BEFORE]
-    if len(tile) - len(alone) <= enough:
-        return False
-    floors = [z for z in (height, alone) if len(z) > FLOOR_SHARE * len(tile)]
-    scatter = [np.subtract(*np.quantile(z, (0.75, 0.25))) for z in floors]
-    floor_scatter = max(FLOOR_SCATTER, ROUGH_FLOOR * len(alone) / len(tile))
-    return bool(min(scatter, default=np.inf) > floor_scatter)
+    tolerance = np.where(c.r < CUT_REACH, tolerance_at(c.r), 0.0)
+    is_on = np.abs(plane.below(c.x, c.y, c.z)) < tolerance
+    extent = scan.extent[c.segment[is_on] * scan.grid.n_bins + c.bin[is_on]]
+    n_flat = np.count_nonzero((extent > 0.0) & (extent <= LAYERS[2]))
+    return bool(n_flat < MOST_FLAT * np.count_nonzero(extent))
 
 
 def refusal(view: View, given: FloatArray) -> str:
