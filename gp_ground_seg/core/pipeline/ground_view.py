@@ -57,15 +57,15 @@ seen from a sensor upside down, there is less than below it, and a scan of one b
 CUT_TILT, CUT_REACH = 0.08, 20.0
 """Tilt [rad] up to which, and range up to which points are on a plane at which all was cut away
 [m]."""
-EDGE = 0.15
+EDGE = 0.2
 """Height of such a plane over the lowest candidate, at most [m]: of uncut scans outdoors 0.2 to 30
 but on even ground. With few beams things end as much higher than the cut."""
 LAYERS, LEAST_LOWEST = (0.01, 0.05, 0.1, 0.2), 10
 """Heights over the lowest candidate of layers of returns [m]: what ends at a cut has about as many
 at all heights; least number in the first layer."""
-LOWEST_SHARE, LAYER_SHARES = 0.025, (0.1, 0.7)
-"""Least share of the third layer that is in the first: cut clouds have 0.036 to 0.33, uneven
-ground 0 to 0.02. Shares of the third in the second, and of the fourth in the third: cut clouds
+LOWEST_SHARE, LAYER_SHARES = 0.06, (0.1, 0.7)
+"""Least share of the third layer that is in the first: cut clouds mostly have 0.06 to 0.33, uneven
+ground 0 to 0.05. Shares of the third in the second, and of the fourth in the third: cut clouds
 mostly have 0.11 to 0.7, level ground up to 0.04 or from 0.75 on."""
 MOST_FLAT = 0.7
 """Share of the cells on the plane, of those with several returns, that are no higher than the
