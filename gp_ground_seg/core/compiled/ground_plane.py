@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray
+from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.core.jit import compiled_form, jit
-from gp_ground_seg.core.pipeline import ground_plane, lowest_points
+from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import (
     CLEARLY_OFF,
     LEAST_REACH,
@@ -22,45 +22,12 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     tukey_weight,
 )
 from gp_ground_seg.core.pipeline.lowest_points import (
-    MAX_Z,
     N_CELLS,
     N_RINGS,
     N_SECTORS,
-    N_TOGETHER,
     RING_EDGES,
     LowestPoints,
-    tolerance_at,
 )
-
-
-@compiled_form(lowest_points.lowest_of_cells)
-def lowest_of_cells(candidates: Candidates) -> tuple[IntArray, IntArray, IntArray, BoolArray]:
-    """Do what the twin does."""
-    r, z, end = candidates.r, candidates.z, candidates.offsets[1:]
-    there, own, n = candidates.offsets.copy(), np.empty(len(r), np.int64), 0
-    found, is_alone = np.empty((3, N_CELLS), np.int64), np.ones(N_CELLS, np.bool_)
-    first = -(-np.arange(N_SECTORS + 1) * len(end) // N_SECTORS)
-    for cell in range(N_CELLS):
-        sector, stop, k = cell // N_RINGS, RING_EDGES[cell % N_RINGS + 1], 0
-        # Each segment of the sector goes on where the ring before has ended.
-        for m in range(first[sector], first[sector + 1]):
-            while there[m] < end[m] and r[there[m]] < stop:
-                c, place = there[m], k
-                there[m] += 1
-                if r[c] >= RING_EDGES[0] and abs(z[c]) < MAX_Z:
-                    while place > 0 and z[own[place - 1]] > z[c]:
-                        own[place] = own[place - 1]
-                        place -= 1
-                    own[place] = c
-                    k += 1
-        if k > 0:
-            found[0, n], found[1, n], found[2, n] = cell, own[0], own[0]
-            for i in range(k - N_TOGETHER + 1):
-                if z[own[i + N_TOGETHER - 1]] - z[own[i]] <= tolerance_at(r[own[i]]):
-                    found[2, n], is_alone[n] = own[i], False
-                    break
-            n += 1
-    return found[0, :n], found[1, :n], found[2, :n], is_alone[:n]
 
 
 @compiled_form(ground_plane.supports_of)

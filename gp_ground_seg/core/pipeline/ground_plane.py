@@ -125,9 +125,10 @@ def find_planes(
     points that are left. `max_slope` is that of the steepest plane to look for, as rise per
     metre; `fit` is `fit_plane`, compiled.
     """
-    is_left = np.ones(N_CELLS, dtype=np.bool_)
+    cells = lowest_points(candidates)
+    is_left = np.ones(len(cells.z), dtype=np.bool_)
     while True:
-        found = GroundPlane(*(fit or fit_plane)(candidates, max_slope, is_left))
+        found = GroundPlane(*(fit or fit_plane)(cells, max_slope, is_left))
         if found.n_support == 0:
             return
         yield found
@@ -139,18 +140,16 @@ SPREAD = (0.5 + np.arange(1, N_TRIPLES + 1)[:, None] * STEPS) % 1.0
 the recurrence R3, whose steps are powers of the root of x^4 = x + 1 (Roberts, 2018)."""
 
 
-def fit_plane(candidates: Candidates, max_slope: float, is_left: BoolArray) -> Any:
+def fit_plane(cells: LowestPoints, max_slope: float, is_left: BoolArray) -> Any:
     """Fields of the best `GroundPlane`, without the last; `n_support` is 0 if there is none.
 
-    It is chosen by the cells that are left, (N_CELLS,), of which those on it are then taken.
+    It is chosen by the points that are left, (C,), of which those on it are then taken.
     """
-    cells = lowest_points(candidates)
-    planes = hypotheses(cells, max_slope)
-    weight = np.where(is_left[cells.cell], cells.weight, 0.0)
+    planes, weight = hypotheses(cells, max_slope), np.where(is_left, cells.weight, 0.0)
     first, score, _ = best_of(planes, cells, weight, 0.0)
     plane, other_height = own_level(cells, first, score, max_slope)
     d = distance(cells.x, cells.y, cells.z, plane) * cells.inverse
-    is_left[cells.cell[np.abs(d) <= 1.0]] = False
+    is_left[np.abs(d) <= 1.0] = False
     return described(cells, plane, other_height)
 
 

@@ -47,29 +47,16 @@ class LowestPoints(NamedTuple):
     is_alone: BoolArray  # (C,) whether there are not `N_TOGETHER`, as where noise is the lowest
 
 
-@shared
 def lowest_points(candidates: Candidates) -> LowestPoints:
     """Lowest ground candidate of each cell, in sectors by rings.
 
     It is the lowest that has `N_TOGETHER` - 1 more within its tolerance above it; where there is
     none, the lowest. Of equally low ones the first candidate comes first.
     """
-    cell, first, lowest, is_alone = lowest_of_cells(candidates)
-    x, y, r = candidates.x[lowest], candidates.y[lowest], candidates.r[lowest]
-    z, lowest_z = candidates.z[lowest], candidates.z[first]
-    weight = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
-    return LowestPoints(x, y, z, r, 1.0 / tolerance_at(r), weight, cell, lowest_z, is_alone)
-
-
-def lowest_of_cells(candidates: Candidates) -> tuple[IntArray, IntArray, IntArray, BoolArray]:
-    """Occupied cells, indices of the lowest candidate of each and of the one that counts.
-
-    The last is whether that lies alone.
-    """
-    r, z = candidates.r, candidates.z
+    r, z, n_segments = candidates.r, candidates.z, candidates.n_segments
     near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
     ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
-    cell = (candidates.segment[near] * N_SECTORS // candidates.n_segments) * N_RINGS + ring
+    cell = (candidates.segment[near] * N_SECTORS // n_segments) * N_RINGS + ring
     # By cell, then by height, as one number: heights add less than half of one.
     order = np.argsort(cell + z[near] / (4.0 * MAX_Z), kind='stable')
     near, cell = near[order], cell[order]
@@ -81,10 +68,12 @@ def lowest_of_cells(candidates: Candidates) -> tuple[IntArray, IntArray, IntArra
     lowest, is_alone = near[first], np.ones(len(first), dtype=np.bool_)
     place = np.searchsorted(cell[first], cell[together])
     lowest[place], is_alone[place] = near[together], False
-    return cell[first], near[first], lowest, is_alone
+    x, y, r = candidates.x[lowest], candidates.y[lowest], r[lowest]
+    weight = np.minimum(r / MIDDLE, 1.0) ** 2 * nearness(r)
+    inverse = 1.0 / tolerance_at(r)
+    return LowestPoints(x, y, z[lowest], r, inverse, weight, cell[first], z[near[first]], is_alone)
 
 
-@shared
 def tolerance_at(r: Values) -> Values:
     """Distance to the plane that a point at range `r` still supports [m]."""
     return TOLERANCE + TOLERANCE_GROWTH * r
