@@ -117,9 +117,9 @@ def _entered(
         # A segment with several entries counts once, by the nearest.
         key = part[entries] * n_segments + candidates.segment[entries]
         nearest = entries[np.unique(key, return_index=True)[1]]
-        arcs = arc_of(candidates.r[nearest], n_segments)
-        width: FloatArray = np.bincount(part[nearest], arcs, len(allowed))[part]
-        return width
+        width = np.zeros(len(allowed))
+        np.add.at(width, part[nearest], arc_of(candidates.r[nearest], n_segments))
+        return width[part]
 
     upper = np.where(is_raised[first], first, second)
     entry = width_of(upper[taken & (is_raised[first] != is_raised[second])])
