@@ -65,7 +65,7 @@ STEPS, AS_EVEN = 0.05, 1.25
 multiple of that over 1 m: of stairs 1.0 to 1.2, of rough banks 1.5."""
 STAIRS_UP = 0.76, 0.94
 """Vertical components of the normal of what is as steep as stairs: 20 to 41 degrees."""
-SAMPLED = 4
+SAMPLED = 2
 """One in so many tiles of the own level tells how much it scatters."""
 
 SUMS = 10
