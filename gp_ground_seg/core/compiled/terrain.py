@@ -10,7 +10,6 @@ from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig
 from gp_ground_seg.core.pipeline.terrain import (
     EVEN,
-    GENTLE,
     MIN_ENTRY,
     MIN_SEEDS,
     MIN_WIDTH,
@@ -22,6 +21,7 @@ from gp_ground_seg.core.pipeline.terrain import (
     arc_of,
     can_step,
     falls,
+    gentle,
     goes_on,
     has_few_entries,
     hides,
@@ -52,16 +52,16 @@ def reachable(
     """See the plain `reachable`, of which the second result is `stands`, to be set."""
     r, n = candidates.r, len(candidates.r)
     parent, part, even = np.arange(n), np.arange(n), np.arange(n)
-    allowed, is_seed, is_own = np.empty(n, np.bool_), np.empty(n, np.bool_), np.empty(n, np.bool_)
-    marks = np.zeros((3, n), np.bool_)
+    allowed, is_steep = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    marks, is_seed, is_own = np.zeros((3, n), np.bool_), allowed.copy(), allowed.copy()
     walk = _Walk(parent, marks[0], part, even, marks[1], marks[2])
     for c in range(n):
         tile = np.uintp(candidates.tile[c])
-        allowed[c] = r[c] < REACH and not (faces.is_face[tile] or faces.is_steep[tile])
+        allowed[c], is_steep[c] = r[c] < REACH and not faces.is_face[tile], faces.is_steep[tile]
         walk.is_raised[c] = allowed[c] and candidates.z[c] + height > RAISED
-    steep, down = _step_along(candidates, allowed, walk)
+    steep, down = _step_along(candidates, allowed, is_steep, walk)
     for aside in range(1, N_ASIDE + 1):
-        _step_aside(candidates, allowed, aside, walk)
+        _step_aside(candidates, allowed, is_steep, aside, walk)
     _step_in_front(candidates, steep, walk)
     _step_in_front(candidates, down, walk)
     is_terrain = allowed.copy()
@@ -149,7 +149,7 @@ def _widths(candidates: Candidates, part: IntArray, marked: BoolArray) -> FloatA
 
 @jit()
 def _step_along(
-    candidates: Candidates, allowed: BoolArray, walk: _Walk
+    candidates: Candidates, allowed: BoolArray, is_steep: BoolArray, walk: _Walk
 ) -> tuple[IntArray, IntArray]:
     """Step between neighbours of a segment.
 
@@ -163,18 +163,19 @@ def _step_along(
             dr, rise = r[c] - r[c - 1], z[c] - z[c - 1]
             if not (allowed[c] and allowed[c - 1]):
                 continue
+            over_steep = is_steep[c - 1] or is_steep[c]
             if dr > largest_gap(r[c]):
                 is_taken = dr <= longest_gap(r[c]) and _goes_on(candidates, offsets[m], c)
             else:
                 is_taken = can_step(dr, rise, STEEP)
                 if can_step(dr, rise, EVEN):
                     _join(walk.even, c - 1, c)
-                if can_step(dr, rise, GENTLE):
+                if can_step(dr, rise, gentle(over_steep)):
                     _step(walk, c - 1, c)
                     continue
             walk.is_fallen[c] = not is_taken and falls(dr, rise)
-            is_end[c] = is_taken
-            is_end_down[c] = walk.is_fallen[c] or (is_taken and rise < 0.0)
+            is_end[c] = is_taken and not over_steep
+            is_end_down[c] = walk.is_fallen[c] or (is_end[c] and rise < 0.0)
     return np.flatnonzero(is_end), np.flatnonzero(is_end_down)
 
 
@@ -234,7 +235,9 @@ def _join_front(
 
 
 @jit()
-def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, walk: _Walk) -> None:
+def _step_aside(
+    candidates: Candidates, allowed: BoolArray, is_steep: BoolArray, aside: int, walk: _Walk
+) -> None:
     """Step from each candidate to the next ones in range of the segment so many further on."""
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     n_segments = len(offsets) - 1
@@ -260,7 +263,8 @@ def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, walk: _W
                     rise = z[there] - z[c]
                     if can_step(distance, rise, EVEN):
                         _join(walk.even, c, there)
-                    if can_step(distance, rise, GENTLE):
+                    over_steep = is_steep[c] or is_steep[there]
+                    if can_step(distance, rise, gentle(over_steep)):
                         _step(walk, c, there)
 
 

@@ -20,7 +20,7 @@ from gp_ground_seg.core.frame import (
     IntArray,
     Values,
 )
-from gp_ground_seg.core.jit import shared
+from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import GrowthConfig
 
 REACH = 60.0
@@ -59,24 +59,26 @@ def reachable(
 ) -> tuple[BoolArray, BoolArray]:
     """Which of the candidates can be reached from enough seeds near the sensor, on foot.
 
-    Vertical faces are no terrain, nor is what is as steep (`Faces.is_steep`). Gentle steps are
-    taken anywhere, steep and long ones only in a front, side by side with others: few lead to a
-    car. A front may mix falls and steps down. A fall is taken only between terrain: what is seen
-    over a hedge is below its top. The plane near the sensor is `height` [m] below the origin.
+    Vertical faces are no terrain. Gentle steps are taken anywhere, steep and long ones only in a
+    front, side by side with others, as few lead to a car, and none over returns as steep as a face
+    (`Faces.is_steep`). A front may mix falls and steps down. A fall is taken only between terrain:
+    what is seen over a hedge is below its top. The plane near the sensor is `height` [m] below the
+    origin.
 
     Returns those, and those that stand on the ground, see `_entered`, two (C,).
     """
     candidates = candidates._replace(z=candidates.z + height)
-    allowed = ~(faces.is_face | faces.is_steep)[candidates.tile] & (candidates.r < REACH)
+    allowed = ~faces.is_face[candidates.tile] & (candidates.r < REACH)
     is_seed = allowed & (candidates.r < growth.seed_range)
     is_seed &= np.abs(candidates.z) < growth.seed_height_tolerance
-    steps = _steps(candidates, allowed)
+    steps, is_steep = _steps(candidates, allowed), faces.is_steep[candidates.tile]
     first, second, is_fall = steps.first, steps.second, steps.is_fall
     rise, is_near = candidates.z[second] - candidates.z[first], ~steps.is_long & ~is_fall
+    over_steep = is_steep[first] | is_steep[second]
     taken, is_even, can_be = (
-        is_near & can_step(steps.length, rise, most) for most in (GENTLE, EVEN, STEEP)
+        is_near & can_step(steps.length, rise, most) for most in (gentle(over_steep), EVEN, STEEP)
     )
-    is_steep_step = ~taken & (steps.is_long | (can_be & (second == first + 1)))
+    is_steep_step = ~(taken | over_steep) & (steps.is_long | (can_be & (second == first + 1)))
     for wanted in (is_steep_step, is_fall | (is_steep_step & (rise < 0.0))):
         taken[wanted] |= _in_front(candidates, first[wanted])
     is_terrain, stands = _entered(candidates, allowed, steps, taken & ~is_fall)
@@ -267,7 +269,16 @@ def arc_of(r: Values, n_segments: int) -> Values:
 
 
 @shared
-def can_step(distance: Values, rise: Values, most: float) -> Values:
+def gentle(over_steep: Values) -> Values:
+    """Largest rise or fall of a step that is taken without others side by side with it [m].
+
+    Over returns that are too steep for terrain it rises or falls by noise alone.
+    """
+    return choose(over_steep, STEP_TOLERANCE, GENTLE)
+
+
+@shared
+def can_step(distance: Values, rise: Values, most: Values) -> Values:
     """Whether a step of this length and rise [m] is one on foot."""
     return np.abs(rise) <= np.minimum(MAX_SLOPE * distance + STEP_TOLERANCE, most)
 
