@@ -23,6 +23,7 @@ from gp_ground_seg.core.pipeline.terrain import (
     falls,
     gentle,
     goes_on,
+    has_few_entries,
     hides,
     largest_gap,
     longest_gap,
@@ -124,7 +125,7 @@ def _leave_out_not_entered(
         if walk.is_raised[c]:
             part = _root(walk.part, c)
             is_terrain[c] = entry[part] >= MIN_ENTRY
-            stands[c] = before[part] >= MIN_ENTRY and not is_terrain[c]
+            stands[c] = has_few_entries(entry[part], before[part])
 
 
 @jit()

@@ -41,10 +41,11 @@ N_ASIDE = 2
 """Segments on each side that a step may lead to."""
 MIN_SEEDS = 8
 """Candidates near the sensor, at the expected height, from which others can be reached."""
-RAISED, MIN_ENTRY = 0.3, 1.5
+RAISED, MIN_ENTRY, MANY_TIMES = 0.3, 1.5, 3.0
 """Height from which terrain is raised [m]; width over which steps must lead up to it [m], as few
 lead to a car. A raised part that fewer lead to is an object, if it is seen so wide before lower
-ground."""
+ground, and so many times as wide as steps lead to it: with 2, mounds and terraces are objects;
+most beds and boxes have no such steps, the tops of others are from 4.6 times as wide."""
 EVEN, OWN, HIDES, BLIND = 0.12, 0.11, 0.22, 5.0
 """Largest rise of an even step; height up to which the own level is seen, and that from which what
 is nearer than that, within this range, hides it unless even steps lead there [m]."""
@@ -106,7 +107,7 @@ def _entered(
 
     Steps (S,) may be `taken`. A hillside is entered all along its foot, a car, if at all, where
     the step to a sill or a bonnet happens to be gentle. Raised candidates that few steps lead up
-    to are no terrain. They stand on the ground if it is seen behind them, over as great a width:
+    to are no terrain. They stand on the ground if it is seen behind them, over a greater width:
     what is behind a wall, up to where nothing is seen, may be the upper one of two levels.
     """
     first, second = steps.first, steps.second
@@ -114,22 +115,22 @@ def _entered(
     both = is_raised[first] & is_raised[second] & taken
     part = _groups(len(allowed), first[both], second[both])
 
-    def is_wide(entries: IntArray) -> BoolArray:
+    def width_of(entries: IntArray) -> FloatArray:
         entries = np.unique(entries)
         # A segment with several entries counts once, by the nearest.
         key = part[entries] * n_segments + candidates.segment[entries]
         nearest = entries[np.unique(key, return_index=True)[1]]
-        arcs = arc_of(candidates.r[nearest], n_segments)
-        result: BoolArray = np.bincount(part[nearest], arcs, len(allowed))[part] >= MIN_ENTRY
-        return result
+        width = np.zeros(len(allowed))
+        np.add.at(width, part[nearest], arc_of(candidates.r[nearest], n_segments))
+        return width[part]
 
     upper = np.where(is_raised[first], first, second)
-    is_entered = is_wide(upper[taken & (is_raised[first] != is_raised[second])])
+    entry = width_of(upper[taken & (is_raised[first] != is_raised[second])])
     low, last = np.flatnonzero(allowed & ~is_raised), np.full(n_segments, -1)
     last[candidates.segment[low]] = low
     is_before_low = is_raised & (np.arange(len(allowed)) < last[candidates.segment])
-    stands = is_raised & ~is_entered & is_wide(np.flatnonzero(is_before_low))
-    return allowed & (~is_raised | is_entered), stands
+    stands = is_raised & has_few_entries(entry, width_of(np.flatnonzero(is_before_low)))
+    return allowed & (~is_raised | (entry >= MIN_ENTRY)), stands
 
 
 def _in_front(candidates: Candidates, near: IntArray) -> BoolArray:
@@ -225,6 +226,15 @@ def hides(r: Values, z: Values, is_reached: Values, growth: GrowthConfig) -> Val
     """
     is_low = z < growth.seed_height_tolerance
     return (r > GAP) & (r < BLIND) & (z > HIDES) & (is_low | ~is_reached)
+
+
+@shared
+def has_few_entries(entry: Values, before: Values) -> Values:
+    """Whether raised candidates stand on the ground: steps lead up to them over a width `entry`.
+
+    They are seen over the width `before` in front of lower ground [m].
+    """
+    return (entry < MIN_ENTRY) & (before >= np.maximum(MIN_ENTRY, MANY_TIMES * entry))
 
 
 @shared
