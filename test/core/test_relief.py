@@ -108,11 +108,12 @@ def test_terrain_ends_at_an_edge_and_goes_on_below(backend, at, depth, share):
 
 def box(x0, x1, y0, y1, high):
     """Level ground with a box on it."""
+    return lambda x, y: high * ((x > x0) & (x < x1) & (y > y0) & (y < y1))
 
-    def terrain(x, y):
-        return high * ((x > x0) & (x < x1) & (y > y0) & (y < y1))
 
-    return terrain
+def plateau(half):
+    """Level ground with one on it, so many m wide to each side, that can be climbed."""
+    return lambda x, y: np.clip(0.8 * np.minimum(x - 6.0, half - np.abs(y)), 0.0, 0.5) * (x < 9.0)
 
 
 LEVEL_TERRAIN = {
@@ -130,8 +131,7 @@ LEVEL_TERRAIN = {
 def test_no_relief_is_what_cannot_be_climbed(backend, name, share):
     candidates = candidates_on(LEVEL_TERRAIN[name], RINGS, share=share)
     relief, over, _ = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
-    assert relief.is_level
-    assert over is candidates
+    assert relief.is_level and over is candidates
     assert (relief.at(np.array([0.0, 9.0]), np.array([0.0, 3.0])) == 0.0).all()
 
 
@@ -141,10 +141,8 @@ STANDING = {
     'pallets': (LEVEL_TERRAIN['pallets'], False),
     'post': (box(6.0, 6.6, -0.2, 0.2, 0.9), False),
     'terrace': (LEVEL_TERRAIN['terrace'], False),
-    'plateau': (
-        lambda x, y: np.clip(0.8 * np.minimum(x - 6.0, 3.0 - np.abs(y)), 0.0, 0.5) * (x < 9.0),
-        False,
-    ),
+    'plateau': (plateau(3.0), False),
+    'narrow plateau': (plateau(1.6), False),
     'bank': (bank(25, 10.0), False),
     'shelf': (box(0.0, 4.5, -2.0, 2.0, 0.27), True),
 }

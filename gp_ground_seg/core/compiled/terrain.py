@@ -12,6 +12,7 @@ from gp_ground_seg.core.pipeline.terrain import (
     EVEN,
     MIN_ENTRY,
     MIN_SEEDS,
+    MIN_WIDTH,
     N_ASIDE,
     OWN,
     RAISED,
@@ -20,11 +21,11 @@ from gp_ground_seg.core.pipeline.terrain import (
     arc_of,
     can_step,
     falls,
+    gentle,
     goes_on,
+    has_few_entries,
     hides,
-    is_gentle,
     largest_gap,
-    least_width,
     longest_gap,
 )
 
@@ -36,7 +37,6 @@ class _Walk(NamedTuple):
     is_raised: BoolArray  # (C,) allowed candidates that are raised
     part: IntArray  # (C,) as `parent`, by steps between raised candidates alone
     even: IntArray  # (C,) as `parent`, by even steps
-    is_foot: BoolArray  # (C,) raised candidates, to which it is too steep from one that is not
     is_entry: BoolArray  # (C,) raised candidates that a step from one that is not leads to
     is_fallen: BoolArray  # (C,) candidates that a fall leads to
 
@@ -51,10 +51,10 @@ def reachable(
 ) -> BoolArray:
     """See the plain `reachable`, of which the second result is `stands`, to be set."""
     r, n = candidates.r, len(candidates.r)
+    parent, part, even = np.arange(n), np.arange(n), np.arange(n)
     allowed, is_steep = np.empty(n, np.bool_), np.empty(n, np.bool_)
-    marks, is_seed = np.zeros((4, n), np.bool_), np.empty(n, np.bool_)
-    parent, part, even, is_own = np.arange(n), np.arange(n), np.arange(n), is_seed.copy()
-    walk = _Walk(parent, marks[0], part, even, marks[1], marks[2], marks[3])
+    marks, is_seed, is_own = np.zeros((3, n), np.bool_), allowed.copy(), allowed.copy()
+    walk = _Walk(parent, marks[0], part, even, marks[1], marks[2])
     for c in range(n):
         tile = np.uintp(candidates.tile[c])
         allowed[c], is_steep[c] = r[c] < REACH and not faces.is_face[tile], faces.is_steep[tile]
@@ -62,8 +62,8 @@ def reachable(
     steep, down = _step_along(candidates, allowed, is_steep, walk)
     for aside in range(1, N_ASIDE + 1):
         _step_aside(candidates, allowed, is_steep, aside, walk)
-    _step_in_front(candidates, steep, is_steep, walk)
-    _step_in_front(candidates, down, is_steep, walk)
+    _step_in_front(candidates, steep, walk)
+    _step_in_front(candidates, down, walk)
     is_terrain = allowed.copy()
     _leave_out_not_entered(candidates, walk, is_terrain, stands)
     for c in range(n):
@@ -109,13 +109,6 @@ def _step(walk: _Walk, a: int, b: int) -> None:
 
 
 @jit()
-def _mark_foot(walk: _Walk, a: int, b: int) -> None:
-    """Mark the one of two candidates that is raised, if the other is not."""
-    if walk.is_raised[a] != walk.is_raised[b]:
-        walk.is_foot[a if walk.is_raised[a] else b] = True
-
-
-@jit()
 def _leave_out_not_entered(
     candidates: Candidates, walk: _Walk, is_terrain: BoolArray, stands: BoolArray
 ) -> None:
@@ -127,14 +120,12 @@ def _leave_out_not_entered(
             is_before[c] = sees_lower and walk.is_raised[c]
             sees_lower |= is_terrain[c] and not walk.is_raised[c]
     entry = _widths(candidates, walk.part, walk.is_entry)
-    foot = _widths(candidates, walk.part, walk.is_foot)
     before = _widths(candidates, walk.part, is_before)
     for c in range(len(is_terrain)):
         if walk.is_raised[c]:
             part = _root(walk.part, c)
             is_terrain[c] = entry[part] >= MIN_ENTRY
-            has_foot = min(foot[part], before[part]) >= MIN_ENTRY
-            stands[c] = has_foot and not is_terrain[c]
+            stands[c] = has_few_entries(entry[part], before[part])
 
 
 @jit()
@@ -172,21 +163,19 @@ def _step_along(
             dr, rise = r[c] - r[c - 1], z[c] - z[c - 1]
             if not (allowed[c] and allowed[c - 1]):
                 continue
+            over_steep = is_steep[c - 1] or is_steep[c]
             if dr > largest_gap(r[c]):
                 is_taken = dr <= longest_gap(r[c]) and _goes_on(candidates, offsets[m], c)
             else:
-                over_steep, is_taken = is_steep[c - 1] or is_steep[c], can_step(dr, rise, STEEP)
+                is_taken = can_step(dr, rise, STEEP)
                 if can_step(dr, rise, EVEN):
                     _join(walk.even, c - 1, c)
-                if is_taken and is_gentle(rise, over_steep):
+                if can_step(dr, rise, gentle(over_steep)):
                     _step(walk, c - 1, c)
                     continue
-                is_sheer = over_steep or not can_step(dr, rise, math.inf)
-                if is_sheer and (is_taken or not falls(dr, rise)):
-                    _mark_foot(walk, c - 1, c)
             walk.is_fallen[c] = not is_taken and falls(dr, rise)
-            is_end[c] = is_taken
-            is_end_down[c] = walk.is_fallen[c] or (is_taken and rise < 0.0)
+            is_end[c] = is_taken and not over_steep
+            is_end_down[c] = walk.is_fallen[c] or (is_end[c] and rise < 0.0)
     return np.flatnonzero(is_end), np.flatnonzero(is_end_down)
 
 
@@ -204,9 +193,7 @@ def _goes_on(candidates: Candidates, first: int, c: int) -> bool:
 
 
 @jit()
-def _step_in_front(
-    candidates: Candidates, steep: IntArray, is_steep: BoolArray, walk: _Walk
-) -> None:
+def _step_in_front(candidates: Candidates, steep: IntArray, walk: _Walk) -> None:
     """Take the steep and long steps in a front; `steep` (S,) are their far ends, in order.
 
     Falls that are not in one are none.
@@ -224,8 +211,7 @@ def _step_in_front(
         front[k] = _root(front, k)
         width[front[k]] += arc_of(candidates.r[steep[k] - 1], n_segments)
     for k in range(len(steep)):
-        over_steep = is_steep[steep[k] - 1] or is_steep[steep[k]]
-        is_wide = width[front[k]] >= least_width(over_steep)
+        is_wide = width[front[k]] >= MIN_WIDTH
         if walk.is_fallen[steep[k]]:
             walk.is_fallen[steep[k]] = is_wide
         elif is_wide:
@@ -274,14 +260,12 @@ def _step_aside(
                     continue
                 if allowed[there] and dr <= gap:
                     distance = math.sqrt(dr * dr + across * across)
-                    rise, over_steep = z[there] - z[c], is_steep[c] or is_steep[there]
+                    rise = z[there] - z[c]
                     if can_step(distance, rise, EVEN):
                         _join(walk.even, c, there)
-                    can_be = can_step(distance, rise, math.inf)
-                    if can_be and is_gentle(rise, over_steep):
+                    over_steep = is_steep[c] or is_steep[there]
+                    if can_step(distance, rise, gentle(over_steep)):
                         _step(walk, c, there)
-                    elif over_steep or not can_be:
-                        _mark_foot(walk, c, there)
 
 
 @jit()

@@ -12,7 +12,7 @@ from gp_ground_seg.core.compiled.roughness import level_at, levels_about, levels
 from gp_ground_seg.core.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Scan, Tiles
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import FacesConfig, LabelConfig
-from gp_ground_seg.core.pipeline.roughness import UNKNOWN, UNKNOWN_LEVEL
+from gp_ground_seg.core.pipeline.roughness import UNKNOWN_LEVEL
 from gp_ground_seg.core.pipeline.vertical_faces import (
     FIRST,
     OWN_SHARE,
@@ -53,18 +53,15 @@ def find_faces(
             shows_ground[t] |= is_foot and is_flat(scan.extent[cell], tolerance)
     tall, tile_to_row = _select_tall(tiles, height, label)
     sums = _sum_returns(scan.xyz, tiles, tall, config.cell_size, height, label, tile_to_row)
-    square = np.empty(len(tall))
     for k in range(len(tall)):
         t, low, high = np.uintp(tall[k]), sums[2 * k], sums[2 * k + 1]
         extent = np.float64(tiles.extremes[t, 1]) - np.float64(tiles.extremes[t, 0])
-        reaches = extent > face_height(label)
-        is_face = reaches and is_vertical(low, high, config)
-        faces.is_face[t] = is_face
-        faces.is_steep[t] = reaches and is_steep(high)
-        is_occluded = is_face and not shows_ground[t] and is_base_occluded(low, high, config)
-        faces.has_occluded_base[t] = is_occluded
-        square[k] = UNKNOWN if is_face else scatter_square(low, high)
-    _mark_scattered(tiles, tall, sums, square, height, label, faces)
+        if extent > face_height(label):
+            faces.is_face[t] = is_face = is_vertical(low, high, config)
+            faces.is_steep[t] = is_steep(high)
+            is_occluded = is_face and not shows_ground[t] and is_base_occluded(low, high, config)
+            faces.has_occluded_base[t] = is_occluded
+    _mark_scattered(tiles, tall, sums, height, label, faces)
     for m in range(len(candidates.offsets) - 1):
         before = 0.0
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
@@ -79,7 +76,6 @@ def _mark_scattered(
     tiles: Tiles,
     tall: CellArray,
     sums: FloatArray,
-    square: FloatArray,
     height: float,
     label: LabelConfig,
     faces: Faces,
@@ -87,22 +83,24 @@ def _mark_scattered(
     """Mark raised tiles about which many scatter. See the plain `vote_on_scatter`."""
     n, n_own, face, n_sides = 0, 0, face_height(label), int(math.sqrt(len(tiles.at)))
     raised, own, whole = np.empty_like(tall), np.empty(len(tall)), np.empty((len(tall), SUMS))
+    square = np.empty(len(tall))
     for k in range(len(tall)):
-        low, high = np.float64(tiles.extremes[tall[k], 0]), np.float64(tiles.extremes[tall[k], 1])
-        if faces.is_face[tall[k]]:
+        t = np.uintp(tall[k])
+        low, high = np.float64(tiles.extremes[t, 0]), np.float64(tiles.extremes[t, 1])
+        if faces.is_face[t]:
             continue
         if low + height > 0.5 * face:
-            raised[n] = k
+            raised[n], square[n] = t, scatter_square(sums[2 * k], sums[2 * k + 1])
             for i in range(SUMS):
                 whole[n, i] = sums[2 * k, i] + sums[2 * k + 1, i]
             n += 1
         elif low + height > -0.5 * face and high - low <= face:
-            own[n_own] = square[k]
+            own[n_own] = scatter_square(sums[2 * k], sums[2 * k + 1])
             n_own += 1
     _, counts = levels_of(own[:n_own], SQUARE_SCATTERS)
     limit = smooth_up_to(SCATTER[level_at(counts, counts.sum(), OWN_SHARE)])
     raised, level = raised[:n], np.empty(n, np.int32)
-    place, square = tiles.place[tall[raised]], square[raised]
+    place = tiles.place[raised]
     block, places, blocks, small = _merged(place, n_sides, whole[:n])
     wide_block, _, _, large = _merged(places, (n_sides + 1) // 2, blocks)
     for k in range(n):
@@ -110,10 +108,9 @@ def _mark_scattered(
         level[k] = vote_on_scatter(square[k], small[b], large[np.uintp(wide_block[b])], limit)
     about = levels_about(place, level, n_sides, SCATTERED, 0)
     for k in range(n):
-        t = tall[raised[k]]
-        over = np.float64(tiles.extremes[t, 0]) + height
+        over = np.float64(tiles.extremes[raised[k], 0]) + height
         if level[k] != UNKNOWN_LEVEL and about[k] > 0 and over > face:
-            faces.is_face[t] = faces.has_occluded_base[t] = True
+            faces.is_face[raised[k]] = faces.has_occluded_base[raised[k]] = True
 
 
 @jit()
@@ -127,13 +124,13 @@ def _merged(
     """
     width, n = (n_sides + 1) // 2, 0
     number, block, places = np.zeros(width * width, np.int32), np.empty_like(place), place.copy()
-    blocks, square, none = np.zeros_like(sums), np.empty(len(sums)), np.zeros(SUMS)
+    blocks, square, none = np.empty_like(sums), np.empty(len(sums)), np.zeros(SUMS)
     for k in range(len(place)):
         # A division of whole numbers takes longer.
         column = np.int32((place[k] + 0.5) / n_sides)
         at = np.uintp((column >> 1) * width + (place[k] - column * n_sides >> 1))
         if number[at] == 0:
-            places[n] = at
+            places[n], blocks[n] = at, 0.0
             n += 1
             number[at] = n
         block[k] = number[at] - 1
@@ -172,9 +169,11 @@ def _sum_returns(
     half = 0.5 * n_sides * tile_size
     for k in range(len(tall)):
         place = tiles.place[tall[k]]
+        # A division of whole numbers takes longer.
+        column = np.int32((place + 0.5) / n_sides)
         # About a point near the tile: about the sensor, rounding would exceed the scatter.
-        sums[2 * k, _X] = in_units((place // n_sides & FIRST) * tile_size - half)
-        sums[2 * k, _Y] = in_units((place % n_sides & FIRST) * tile_size - half)
+        sums[2 * k, _X] = in_units((column & FIRST) * tile_size - half)
+        sums[2 * k, _Y] = in_units((place - column * n_sides & FIRST) * tile_size - half)
         sums[2 * k, _BASE] = tiles.extremes[tall[k], 0]
     foot_height, max_height = label.ground_tolerance, label.obstacle_max_height
     x, y, z, tile = columns[0], columns[1], columns[2], tiles.tile

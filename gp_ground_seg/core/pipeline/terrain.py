@@ -41,9 +41,11 @@ N_ASIDE = 2
 """Segments on each side that a step may lead to."""
 MIN_SEEDS = 8
 """Candidates near the sensor, at the expected height, from which others can be reached."""
-RAISED, MIN_ENTRY = 0.3, 1.5
+RAISED, MIN_ENTRY, MANY_TIMES = 0.3, 1.5, 3.0
 """Height from which terrain is raised [m]; width over which steps must lead up to it [m], as few
-lead to a car. A raised part that fewer lead to is an object, if its foot is seen so wide."""
+lead to a car. A raised part that fewer lead to is an object, if it is seen so wide before lower
+ground, and so many times as wide as steps lead to it: with 2, mounds and terraces are objects;
+most beds and boxes have no such steps, the tops of others are from 4.6 times as wide."""
 EVEN, OWN, HIDES, BLIND = 0.12, 0.11, 0.22, 5.0
 """Largest rise of an even step; height up to which the own level is seen, and that from which what
 is nearer than that, within this range, hides it unless even steps lead there [m]."""
@@ -59,10 +61,10 @@ def reachable(
     """Which of the candidates can be reached from enough seeds near the sensor, on foot.
 
     Vertical faces are no terrain. Gentle steps are taken anywhere, steep and long ones only in a
-    front, side by side with others: few lead to a car. Near returns that are steeper than terrain
-    (`Faces.is_steep`) no step is gentle. A front may mix falls and steps down. A fall is taken
-    only between terrain: what is seen over a hedge is below its top. The plane near the sensor is
-    `height` [m] below the origin.
+    front, side by side with others, as few lead to a car, and none over returns as steep as a face
+    (`Faces.is_steep`). A front may mix falls and steps down. A fall is taken only between terrain:
+    what is seen over a hedge is below its top. The plane near the sensor is `height` [m] below the
+    origin.
 
     Returns those, and those that stand on the ground, see `_entered`, two (C,).
     """
@@ -70,19 +72,17 @@ def reachable(
     allowed = ~faces.is_face[candidates.tile] & (candidates.r < REACH)
     is_seed = allowed & (candidates.r < growth.seed_range)
     is_seed &= np.abs(candidates.z) < growth.seed_height_tolerance
-    is_steep = faces.is_steep[candidates.tile]
-    steps = _steps(candidates, allowed)
+    steps, is_steep = _steps(candidates, allowed), faces.is_steep[candidates.tile]
     first, second, is_fall = steps.first, steps.second, steps.is_fall
-    rise = candidates.z[second] - candidates.z[first]
-    over_steep, is_near = is_steep[first] | is_steep[second], ~steps.is_long & ~is_fall
-    can_be = is_near & can_step(steps.length, rise, math.inf)
-    taken, is_even = can_be & is_gentle(rise, over_steep), can_be & (np.abs(rise) <= EVEN)
-    is_sheer = is_near & ~taken & (over_steep | ~can_be)
-    is_steep_step = steps.is_long | (can_be & (second == first + 1) & (np.abs(rise) <= STEEP))
-    is_steep_step &= ~taken
+    rise, is_near = candidates.z[second] - candidates.z[first], ~steps.is_long & ~is_fall
+    over_steep = is_steep[first] | is_steep[second]
+    taken, is_even, can_be = (
+        is_near & can_step(steps.length, rise, most) for most in (gentle(over_steep), EVEN, STEEP)
+    )
+    is_steep_step = ~(taken | over_steep) & (steps.is_long | (can_be & (second == first + 1)))
     for wanted in (is_steep_step, is_fall | (is_steep_step & (rise < 0.0))):
-        taken[wanted] |= _in_front(candidates, first[wanted], over_steep[wanted])
-    is_terrain, stands = _entered(candidates, allowed, steps, taken & ~is_fall, is_sheer)
+        taken[wanted] |= _in_front(candidates, first[wanted])
+    is_terrain, stands = _entered(candidates, allowed, steps, taken & ~is_fall)
     taken &= ~is_fall | (is_terrain[first] & is_terrain[second])
     is_reached = is_terrain & _reached(is_seed, first[taken], second[taken])
     is_own = allowed & (candidates.z < OWN)
@@ -101,52 +101,44 @@ def _reached(is_seed: BoolArray, first: IntArray, second: IntArray) -> BoolArray
 
 
 def _entered(
-    candidates: Candidates,
-    allowed: BoolArray,
-    steps: _Steps,
-    taken: BoolArray,
-    is_sheer: BoolArray,
+    candidates: Candidates, allowed: BoolArray, steps: _Steps, taken: BoolArray
 ) -> tuple[BoolArray, BoolArray]:
     """Candidates that may be terrain, and those that stand on the ground, two (C,).
 
-    Steps (S,) are `taken`, or too steep, `is_sheer`. A hillside is entered all along its foot, a
-    car, if at all, where the step to a sill or a bonnet happens to be gentle. Raised candidates
-    that few steps lead up to are no terrain. They stand on the ground if it is seen before them,
-    where they are sheer, and behind them. What is behind a wall, up to where nothing is seen, may
-    be the upper one of two levels.
+    Steps (S,) may be `taken`. A hillside is entered all along its foot, a car, if at all, where
+    the step to a sill or a bonnet happens to be gentle. Raised candidates that few steps lead up
+    to are no terrain. They stand on the ground if it is seen behind them, over a greater width:
+    what is behind a wall, up to where nothing is seen, may be the upper one of two levels.
     """
     first, second = steps.first, steps.second
     is_raised, n_segments = allowed & (candidates.z > RAISED), len(candidates.offsets) - 1
     both = is_raised[first] & is_raised[second] & taken
     part = _groups(len(allowed), first[both], second[both])
 
-    def is_wide(entries: IntArray) -> BoolArray:
+    def width_of(entries: IntArray) -> FloatArray:
         entries = np.unique(entries)
         # A segment with several entries counts once, by the nearest.
         key = part[entries] * n_segments + candidates.segment[entries]
         nearest = entries[np.unique(key, return_index=True)[1]]
-        arcs = arc_of(candidates.r[nearest], n_segments)
-        result: BoolArray = np.bincount(part[nearest], arcs, len(allowed))[part] >= MIN_ENTRY
-        return result
+        width = np.zeros(len(allowed))
+        np.add.at(width, part[nearest], arc_of(candidates.r[nearest], n_segments))
+        return width[part]
 
     upper = np.where(is_raised[first], first, second)
-    leads_up = is_raised[first] != is_raised[second]
-    is_entered = is_wide(upper[leads_up & taken])
+    entry = width_of(upper[taken & (is_raised[first] != is_raised[second])])
     low, last = np.flatnonzero(allowed & ~is_raised), np.full(n_segments, -1)
     last[candidates.segment[low]] = low
     is_before_low = is_raised & (np.arange(len(allowed)) < last[candidates.segment])
-    stands = is_raised & ~is_entered
-    stands &= is_wide(upper[leads_up & is_sheer]) & is_wide(np.flatnonzero(is_before_low))
-    return allowed & (~is_raised | is_entered), stands
+    stands = is_raised & has_few_entries(entry, width_of(np.flatnonzero(is_before_low)))
+    return allowed & (~is_raised | (entry >= MIN_ENTRY)), stands
 
 
-def _in_front(candidates: Candidates, near: IntArray, over_steep: BoolArray) -> BoolArray:
+def _in_front(candidates: Candidates, near: IntArray) -> BoolArray:
     """Which steep steps, from the candidates `near` (S,) to the next, are in a front, (S,).
 
-    Such a front is wider where they are `over_steep` (S,) returns, see `least_width`. Two steps
-    are side by side if they are in segments at most `N_ASIDE` apart and overlap in range and in
-    height: of a segment, the first that ends no nearer than the other begins, or the one behind
-    it.
+    Two steps are side by side if they are in segments at most `N_ASIDE` apart and overlap in range
+    and in height: of a segment, the first that ends no nearer than the other begins, or the one
+    behind it.
     """
     n_segments, segment = len(candidates.offsets) - 1, candidates.segment[near]
     r, z = candidates.r, candidates.z
@@ -164,7 +156,7 @@ def _in_front(candidates: Candidates, near: IntArray, over_steep: BoolArray) -> 
             pairs.append(np.stack([np.arange(n), other])[:, is_beside])
     front = _groups(n, *np.concatenate(pairs, axis=1))
     width = np.bincount(front, arc_of(begin, n_segments))
-    result: BoolArray = width[front] >= least_width(over_steep)
+    result: BoolArray = (width >= MIN_WIDTH)[front]
     return result
 
 
@@ -237,6 +229,15 @@ def hides(r: Values, z: Values, is_reached: Values, growth: GrowthConfig) -> Val
 
 
 @shared
+def has_few_entries(entry: Values, before: Values) -> Values:
+    """Whether raised candidates stand on the ground: steps lead up to them over a width `entry`.
+
+    They are seen over the width `before` in front of lower ground [m].
+    """
+    return (entry < MIN_ENTRY) & (before >= np.maximum(MIN_ENTRY, MANY_TIMES * entry))
+
+
+@shared
 def largest_gap(r: Values) -> Values:
     """Longest step along a segment at a range [m]."""
     return GAP + GAP_GROWTH * r
@@ -269,24 +270,18 @@ def arc_of(r: Values, n_segments: int) -> Values:
 
 
 @shared
-def can_step(distance: Values, rise: Values, most: float) -> Values:
-    """Whether a step of this length and rise [m] is one on foot."""
-    return np.abs(rise) <= np.minimum(MAX_SLOPE * distance + STEP_TOLERANCE, most)
-
-
-@shared
-def is_gentle(rise: Values, over_steep: Values) -> Values:
-    """Whether a step may be taken without others side by side with it.
+def gentle(over_steep: Values) -> Values:
+    """Largest rise or fall of a step that is taken without others side by side with it [m].
 
     Over returns that are too steep for terrain it rises or falls by noise alone.
     """
-    return np.abs(rise) <= choose(over_steep, STEP_TOLERANCE, GENTLE)
+    return choose(over_steep, STEP_TOLERANCE, GENTLE)
 
 
 @shared
-def least_width(over_steep: Values) -> Values:
-    """Width from which on a front is one of terrain [m]."""
-    return choose(over_steep, 2.0, 1.0) * MIN_WIDTH
+def can_step(distance: Values, rise: Values, most: Values) -> Values:
+    """Whether a step of this length and rise [m] is one on foot."""
+    return np.abs(rise) <= np.minimum(MAX_SLOPE * distance + STEP_TOLERANCE, most)
 
 
 def with_standing(faces: Faces, tile: CellArray, stands: BoolArray) -> Faces:
