@@ -85,7 +85,7 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
         raise errors.MissingDependencyError(
             f'numba is not installed, nothing to compile: {errors.install_hint("numba")}'
         )
-    errors.LOGGER.info('compiling what is not on disk yet: 20 to 60 s for all of it')
+    errors.LOGGER.info('compiling what is not on disk yet: 30 to 90 s for all of it')
     begin = time.monotonic()
     compile_all()
     seconds, folder = time.monotonic() - begin, code_folder()

@@ -173,7 +173,7 @@ class _CodeFile:
             self._begin_turn()
             if (code := self._read().get(key)) is None:
                 log_once(
-                    logging.WARNING, 'compiling once for this processor, which takes 20 to 60 s'
+                    logging.WARNING, 'compiling once for this processor, which takes 30 to 90 s'
                 )
                 return None
             self._end_turn()  # another process has compiled it meanwhile
@@ -237,7 +237,7 @@ def _list(path: Path) -> None:
 def _log_not_kept(reason: object) -> None:
     log_once(
         logging.WARNING,
-        'compiled code is not kept on disk (%s): every start compiles, which takes 20 to 60 s; '
+        'compiled code is not kept on disk (%s): every start compiles, which takes 30 to 90 s; '
         'set NUMBA_CACHE_DIR to a folder of your own',
         reason,
     )

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gp_ground_seg.core.backend import Backend
 
 FOLLOWS = (
-    'segmenting with numpy until the compiled code is there: a second, or 20 to 60 s to compile it'
+    'segmenting with numpy until the compiled code is there: a second, or 30 to 90 s to compile it'
 )
 CHANGED = 'segmenting with numba now'
 STAYS = 'segmenting with numpy from now on'
@@ -100,7 +100,7 @@ class BackendLoader(threading.Thread):
         """End the compiling process, and wait for the thread; `on_done` is not called any more.
 
         Not for one that compiles in this process, where no folder can keep the code: that takes
-        20 to 60 s.
+        30 to 90 s.
         """
         with self._lock:
             self._is_closed = True

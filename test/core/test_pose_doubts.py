@@ -287,9 +287,8 @@ def test_a_rough_path_between_hedges_is_no_cut_cloud(is_gutter):
     rise = 0.024 * np.abs(x) if is_gutter else 0.05 * np.sin(5.0 * x) * np.cos(4.0 * y)
     path = np.stack([x, y, rise - 0.4], axis=-1)
     x, z = np.meshgrid(np.arange(-6.0, 6.0, 0.05), np.arange(-0.4, 0.6, 0.1))
-    hedges = [np.stack([x, np.full_like(x, side), z], axis=-1) for side in (-1.15, 1.15)]
-    parts = (path,) if is_gutter else (path, *hedges)
-    pose = pose_of(np.concatenate([part.reshape(-1, 3) for part in parts]))
+    hedges = [np.stack([x, 0.0 * x + side, z], -1) for side in (-1.15, 1.15) if not is_gutter]
+    pose = pose_of(np.concatenate([part.reshape(-1, 3) for part in (path, *hedges)]))
     assert pose.height == pytest.approx(0.4, abs=0.05) and pose.warnings == ()
 
 

@@ -55,8 +55,8 @@ CLEAR = 0.3
 seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
 
 COLUMN, COLUMNS = (0.2, 0.6), 0.55
-"""Heights over the plane between which a column is looked for over what is on it [m]; share of that
-with a column from which it is lower ends, unless there is a floor."""
+"""Heights over the plane between which a column is looked for over what is on it [m]; share with
+a column from which it is lower ends, unless there is a floor."""
 BEFORE, FLOOR_SHARE, FLOOR_SCATTER = 0.1, 0.1, 0.025
 """Distance from which a return before a column is of the floor before it [m]; least share of such
 returns, and distance of the quartiles of their heights, up to which they show a floor [m]: 0.003

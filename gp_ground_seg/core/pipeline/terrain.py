@@ -44,8 +44,8 @@ MIN_SEEDS = 8
 RAISED, MIN_ENTRY, MANY_TIMES = 0.3, 1.5, 3.0
 """Height from which terrain is raised [m]; width over which steps must lead up to it [m], as few
 lead to a car. A raised part that fewer lead to is an object, if it is seen so wide before lower
-ground, and so many times as wide as steps lead to it: with 2, mounds and terraces are objects;
-most beds and boxes have no such steps, the tops of others are from 4.6 times as wide."""
+ground, and so many times as wide as steps lead to it: with 1 parts of mounds and terraces are.
+Most beds and boxes have no such steps."""
 EVEN, OWN, HIDES, BLIND = 0.12, 0.11, 0.22, 5.0
 """Largest rise of an even step; height up to which the own level is seen, and that from which what
 is nearer than that, within this range, hides it unless even steps lead there [m]."""
