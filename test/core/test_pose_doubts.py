@@ -269,7 +269,7 @@ def test_many_cells_tell_the_tilt_among_more_of_other_things():
 
 
 @pytest.mark.parametrize('sensor', [SMALL_VLP, SMALL_OS1], ids=lambda s: s.name)
-@pytest.mark.parametrize('scene', ['car_park', 'traffic_jam'])
+@pytest.mark.parametrize('scene', ['car_park', 'traffic_jam', 'hedge'])
 def test_lower_ends_of_objects_are_no_ground(scene, sensor):
     """The ground was cut away before; a height that is given is taken."""
     made = scan_of(scene, sensor, 1.8, seed=3)
