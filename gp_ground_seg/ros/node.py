@@ -236,7 +236,7 @@ class GroundSegmentationNode(ConfiguredNode):
 class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[misc]
     """A `GroundSegmentationNode` that begins and ends with the transitions of ROS.
 
-    *configure* begins to make the compiled backend: for half a minute *active* may mean numpy.
+    *configure* begins to make the compiled backend: for a minute *active* may mean numpy.
     *activate* subscribes, and begins the bond that Nav2's lifecycle manager waits for;
     *deactivate* ends both; *cleanup*, *shutdown* and an error free the backend. Parameters can be
     set in every state. Options are those of `rclpy.node.Node`.

@@ -140,7 +140,8 @@ SPREAD = (0.5 + np.arange(1, N_TRIPLES + 1)[:, None] * STEPS) % 1.0
 the recurrence R3, whose steps are powers of the root of x^4 = x + 1 (Roberts, 2018)."""
 
 
-def fit_plane(cells: LowestPoints, max_slope: float, is_left: BoolArray) -> Any:
+@shared
+def fit_plane(cells: LowestPoints, max_slope: float, is_left: BoolArray) -> tuple[float, ...]:
     """Fields of the best `GroundPlane`, without the last; `n_support` is 0 if there is none.
 
     It is chosen by the points that are left, (C,), of which those on it are then taken.
@@ -424,7 +425,7 @@ def solve_plane(moments: Any, plane: Any) -> tuple[Values, Values, Values]:
 
 
 @shared
-def described(cells: LowestPoints, plane: Plane, other_height: float) -> Any:
+def described(cells: LowestPoints, plane: Plane, other_height: float) -> tuple[float, ...]:
     """Fields of a `GroundPlane` that say how well it is seen."""
     height, sector, inverse = plane[0], cells.cell // N_RINGS, cells.inverse
     d, is_first = distance(cells.x, cells.y, cells.z, plane), is_new(sector)
@@ -434,11 +435,11 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> Any:
     is_off, lowest = np.abs(d * inverse) > 1.0, distance(cells.x, cells.y, cells.lowest_z, plane)
     d, z = np.where(is_off, lowest, d), np.where(is_off, cells.lowest_z, cells.z)
     is_on = np.abs(d * inverse) <= 1.0
-    n = np.count_nonzero(is_on)
+    n = int(np.count_nonzero(is_on))
     if n == 0:
         return *plane, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0.0, other_height
     other = distance(cells.x, cells.y, z, (other_height, plane[1], plane[2]))
-    most = max(n, np.count_nonzero(np.abs(other * inverse) <= 1.0))
+    most = max(n, int(np.count_nonzero(np.abs(other * inverse) <= 1.0)))
     d, z, r = d[is_on], z[is_on], cells.r[is_on]
     few, many, near = n // 10, 9 * n // 10, d[r < NEAR]
     drop = np.sort(np.arctan2(-z, r))

@@ -70,7 +70,7 @@ but on even ground. With few beams things end as much higher than the cut."""
 LAYERS, LEAST_LOWEST = (0.01, 0.05, 0.1, 0.2), 10
 """Heights over the lowest candidate of layers of returns [m]: what ends at a cut has about as many
 at all heights; least number in the first layer."""
-LOWEST_SHARE, LAYER_SHARES = 0.06, (0.1, 0.7)
+LOWEST_SHARE, LEAST_SHARE, MOST_SHARE = 0.06, 0.1, 0.7
 """Least share of the third layer that is in the first: cut clouds mostly have 0.06 to 0.33, uneven
 ground 0 to 0.05. Shares of the third in the second, and of the fourth in the third: cut clouds
 mostly have 0.11 to 0.7, level ground up to 0.04 or from 0.75 on."""
@@ -234,9 +234,8 @@ def _is_at_edge(scan: Scan, is_on: BoolArray) -> bool:
     c, z = scan.candidates, scan.xyz[scan.grid.inside, 2]
     first, *layers = (np.count_nonzero(z < c.z.min() + layer) for layer in LAYERS)
     shares = layers[0] / layers[1], layers[1] / layers[2]
-    least, most = LAYER_SHARES
     is_edge = first >= max(LEAST_LOWEST, LOWEST_SHARE * layers[1])
-    if not is_edge or min(shares) < least or max(shares) > most:
+    if not is_edge or min(shares) < LEAST_SHARE or max(shares) > MOST_SHARE:
         return False
     extent = scan.extent[c.segment[is_on] * scan.grid.n_bins + c.bin[is_on]]
     n_flat = np.count_nonzero((extent > 0.0) & (extent <= LAYERS[2]))
