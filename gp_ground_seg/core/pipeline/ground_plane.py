@@ -142,15 +142,14 @@ the recurrence R3, whose steps are powers of the root of x^4 = x + 1 (Roberts, 2
 
 @shared
 def fit_plane(cells: LowestPoints, max_slope: float, is_left: BoolArray) -> tuple[float, ...]:
-    """Fields of the best `GroundPlane`, without the last; `n_support` is 0 if there is none.
+    """Fields of the best `GroundPlane` in their order, but the last; `n_support` 0 without one.
 
     It is chosen by the points that are left, (C,), of which those on it are then taken.
     """
     planes, weight = hypotheses(cells, max_slope), np.where(is_left, cells.weight, 0.0)
     first, score, _ = best_of(planes, cells, weight, 0.0)
     plane, other_height = own_level(cells, first, score, max_slope)
-    d = distance(cells.x, cells.y, cells.z, plane) * cells.inverse
-    is_left[np.abs(d) <= 1.0] = False
+    is_left[np.abs(distance(cells.x, cells.y, cells.z, plane) * cells.inverse) <= 1.0] = False
     return described(cells, plane, other_height)
 
 
@@ -426,7 +425,7 @@ def solve_plane(moments: Any, plane: Any) -> tuple[Values, Values, Values]:
 
 @shared
 def described(cells: LowestPoints, plane: Plane, other_height: float) -> tuple[float, ...]:
-    """Fields of a `GroundPlane` that say how well it is seen."""
+    """Measure how well a plane is seen; return what `fit_plane` does."""
     height, sector, inverse = plane[0], cells.cell // N_RINGS, cells.inverse
     d, is_first = distance(cells.x, cells.y, cells.z, plane), is_new(sector)
     is_over = (d * inverse > CLEARLY_OFF) & (cells.z < 0.0) & is_first

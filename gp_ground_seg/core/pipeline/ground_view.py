@@ -62,8 +62,7 @@ BEFORE, FLOOR_SHARE, FLOOR_SCATTER = 0.1, 0.1, 0.025
 returns, and distance of the quartiles of their heights, up to which they show a floor [m]: 0.003
 to 0.02 in crowded rooms and corridors."""
 CUT_TILT, CUT_REACH = 0.08, 20.0
-"""Tilt [rad] up to which, and range up to which points are on a plane at which all was cut away
-[m]."""
+"""Largest tilt [rad] of a plane of lower ends, and range of the points that show it [m]."""
 EDGE = 0.2
 """Height of such a plane over the lowest candidate, at most [m]: of uncut scans outdoors 0.2 to 30
 but on even ground. With few beams things end as much higher than the cut."""

@@ -168,8 +168,9 @@ def estimate_pose(
         return dataclasses.replace(given, contradictions=contradictions, doubts=doubts)
     plane, tells_height = view.plane, view.tells_height
     up = given.rotation.T @ view.up
-    is_tilted = view.tells_tilt and view.up[2] <= math.cos(CLEAR_TILT)
-    pose = _levelled(given, up, sensor) if is_tilted else given
+    pose = _levelled(given, up, sensor)
+    if not view.tells_tilt or pose.rotation[2] @ given.rotation[2] > math.cos(CLEAR_TILT):
+        pose = given
     # Along the vertical of the pose used, not across the plane.
     vertical = pose.rotation[2]
     height = plane.near_height * plane.normal[2] / (vertical @ up) - vertical @ pose.origin
