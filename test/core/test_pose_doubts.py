@@ -292,6 +292,13 @@ def test_a_rough_path_between_hedges_is_no_cut_cloud(is_gutter):
     assert pose.height == pytest.approx(0.4, abs=0.05) and pose.warnings == ()
 
 
+def test_a_hollow_around_few_beams_is_no_cut_cloud():
+    azimuth, angle = np.meshgrid(np.arange(0.0, 6.28, 0.01), np.radians(np.arange(-1.0, 16.0, 2.0)))
+    r = 0.3 / (0.06 + np.tan(angle))  # beams on a cone, 0.3 m above its tip
+    points = np.stack([r * np.cos(azimuth), r * np.sin(azimuth), -r * np.tan(angle)], axis=-1)
+    assert LOWER_ENDS not in pose_of(points.reshape(-1, 3)).warnings
+
+
 @pytest.mark.parametrize(
     ('scale', 'move', 'said'),
     [(1.0, (60.0, 20.0, 0.0), 'the origin of the cloud is not the sensor'),

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import BoolArray, FloatArray, Scan, as_index
+from gp_ground_seg.core.frame import FloatArray, Scan
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.lowest_points import FARTHEST, N_SECTORS, tolerance_at
 from gp_ground_seg.core.pipeline.points import angles_of, rotation
@@ -54,13 +54,9 @@ CLEAR = 0.3
 """Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
 seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
 
-COLUMN, COLUMNS = (0.2, 0.6), 0.55
-"""Heights over the plane between which a column is looked for over what is on it [m]; share with
-a column from which it is lower ends, unless there is a floor."""
-BEFORE, FLOOR_SHARE, FLOOR_SCATTER = 0.1, 0.1, 0.025
-"""Distance from which a return before a column is of the floor before it [m]; least share of such
-returns, and distance of the quartiles of their heights, up to which they show a floor [m]: 0.003
-to 0.02 in crowded rooms and corridors."""
+FLOOR_SCATTER = 0.04
+"""Distance of the quartiles of the heights of what is on a plane, up to which it is a floor [m]: 0
+to 0.033 in rooms and corridors; walls and lower ends of things mostly have 0.044 and more."""
 CUT_TILT, CUT_REACH = 0.08, 20.0
 """Largest tilt [rad] of a plane of lower ends, and range of the points that show it [m]."""
 EDGE = 0.2
@@ -75,7 +71,8 @@ ground 0 to 0.05. Shares of the third in the second, and of the fourth in the th
 mostly have 0.11 to 0.7, level ground up to 0.04 or from 0.75 on."""
 MOST_FLAT = 0.7
 """Share of the cells on the plane, of those with several returns, that are no higher than the
-third layer, from which it is ground: roads with a gutter have 0.96, cut clouds 0 to 0.65."""
+third layer, from which it is ground: roads with a gutter have 0.96, cut clouds 0 to 0.65, but
+hedges cut where the lowest of few beams end on them."""
 LOWER_ENDS = (
     'the lowest returns are the lower ends of objects: the ground is not seen, or was cut away '
     'before, by a crop box or a pass-through filter'
@@ -216,48 +213,28 @@ def objection_to_ground(scan: Scan, view: View | None) -> str:
 def _shows_lower_ends(view: View, scan: Scan) -> bool:
     """Whether a plane is one of lower ends: of things cut away below it, or of walls."""
     plane, c = view.plane, scan.candidates
-    if plane.normal[2] < math.cos(CUT_TILT):
+    # A slope that is seen in few directions scatters as lower ends do.
+    if plane.normal[2] < math.cos(CUT_TILT) or plane.coverage < MIN_COVERAGE:
         return False
     height = plane.below(c.x, c.y, c.z)
     is_on = np.abs(height) < np.where(c.r < CUT_REACH, tolerance_at(c.r), 0.0)
-    if -plane.height - c.z.min() <= EDGE and _is_at_edge(scan, is_on):
-        return True
-    return not view.is_surface and _is_of_columns(plane, scan, height, is_on)
-
-
-def _is_at_edge(scan: Scan, is_on: BoolArray) -> bool:
-    """Whether all was cut away below: returns are as many at all heights over the lowest.
-
-    `is_on` (C,) are the candidates on the plane.
-    """
-    c, z = scan.candidates, scan.xyz[scan.grid.inside, 2]
-    first, *layers = (np.count_nonzero(z < c.z.min() + layer) for layer in LAYERS)
-    shares = layers[0] / layers[1], layers[1] / layers[2]
-    is_edge = first >= max(LEAST_LOWEST, LOWEST_SHARE * layers[1])
-    if not is_edge or min(shares) < LEAST_SHARE or max(shares) > MOST_SHARE:
-        return False
     extent = scan.extent[c.segment[is_on] * scan.grid.n_bins + c.bin[is_on]]
     n_flat = np.count_nonzero((extent > 0.0) & (extent <= LAYERS[2]))
-    return bool(n_flat < MOST_FLAT * np.count_nonzero(extent))
-
-
-def _is_of_columns(plane: GroundPlane, scan: Scan, height: FloatArray, is_on: BoolArray) -> bool:
-    """Whether most of what is on a plane has a column over it, and the rest is no floor.
-
-    `height` (C,) is that of the candidates over it [m].
-    """
-    (low, high), tiles, over = COLUMN, scan.tiles, plane.below(*scan.xyz.T)
-    in_column = (over > low) & (over < high) & (tiles.tile >= 0)
-    column_r = np.full(len(tiles.extremes), np.inf)
-    np.minimum.at(column_r, tiles.tile[in_column], scan.grid.r[in_column])
-    # Floor before a column is nearer than what stands on it.
-    tile, r = as_index(scan.candidates.tile[is_on]), scan.candidates.r[is_on]
-    alone = height[is_on][r < column_r[tile] - BEFORE]
-    if len(tile) - len(alone) <= COLUMNS * len(tile):
+    if n_flat >= MOST_FLAT * np.count_nonzero(extent):
         return False
-    floors = [z for z in (height[is_on], alone) if len(z) > FLOOR_SHARE * len(tile)]
-    scatter = min(np.subtract(*np.quantile(z, (0.75, 0.25))) for z in floors)
-    return bool(scatter > FLOOR_SCATTER)
+    low, high = np.quantile(height[is_on], (0.25, 0.75))
+    if high - low > FLOOR_SCATTER and not view.is_surface:
+        return True
+    return bool(-plane.height - c.z.min() <= EDGE and _is_cut(scan))
+
+
+def _is_cut(scan: Scan) -> bool:
+    """Whether returns are as many at all heights over the lowest candidate."""
+    low, z = scan.candidates.z.min(), scan.xyz[scan.grid.inside, 2]
+    first, *layers = (np.count_nonzero(z < low + layer) for layer in LAYERS)
+    shares = layers[0] / layers[1], layers[1] / layers[2]
+    is_edge = first >= max(LEAST_LOWEST, LOWEST_SHARE * layers[1])
+    return bool(is_edge and min(shares) >= LEAST_SHARE and max(shares) <= MOST_SHARE)
 
 
 def refusal(view: View, given: FloatArray) -> str:
