@@ -306,7 +306,8 @@ class GroundSegmenter:
                 again = self._look(near) or view
                 # Walls close by have returns where any image would be, and show no plane.
                 if _is_mirror(again, scan):
-                    return again._replace(is_mirror=True)
+                    plane = again.plane._replace(is_below_sensor=is_below_sensor(again.plane, scan))
+                    return again._replace(plane=plane, is_mirror=True)
         return below
 
     def _about_axes(self, xyz: PointArray, below: View | None) -> View | None:

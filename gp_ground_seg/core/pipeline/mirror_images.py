@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray, PointArray, Scan
+from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray, PointArray, Scan
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.ground_view import View
 from gp_ground_seg.core.pipeline.lowest_points import tolerance_at
@@ -37,9 +37,10 @@ WET_SHARE, WET_REACH = 0.1, 20.0
 asked for what they are images of."""
 COUNTERPART = 0.2
 """Side of the boxes in which a counterpart is looked for: its own and those around it [m]."""
-MIRRORED = 0.4
-"""Share of what is deep below a plane that has a counterpart over it, from which the plane is a
-mirror. Simulated wet scans have 0.45 to 0.88, dry real ones outdoors none: the tiles tell them."""
+MIRRORED = 0.2
+"""Share of what is deep below a plane that has a counterpart over it and is seen through it, from
+which the plane is a mirror: simulated wet scans have 0.27 to 0.72, crowded rooms up to 0.15, dry
+scans outdoors none: the tiles tell them."""
 
 
 class MirrorImages(NamedTuple):
@@ -73,21 +74,22 @@ def find_mirror_images(scan: Scan, pose: SensorPose, view: View | None) -> Mirro
     above the line of sight to ground that is seen nearer. Where rays start must be known, or
     nothing is told. `view` is the plane that the pose was estimated from, if there is one.
     """
-    grid, plane_z = scan.grid, -pose.sensor_height
-    if not pose.starts_rays or plane_z >= 0.0 or (view is not None and view.is_dry):
+    grid, plane = scan.grid, pose.plane
+    if not pose.starts_rays or plane.height <= 0.0 or (view is not None and view.is_dry):
         return NO_IMAGES
     is_mirror = view is not None and view.is_mirror and pose.height_estimated
-    if not is_mirror and mirror_share(GroundPlane(pose.sensor_height), scan) < MIRRORED:
+    if not is_mirror and mirror_share(plane, scan) < MIRRORED:
         return NO_IMAGES
     inside = np.flatnonzero(grid.inside)
-    r, z = grid.r[inside].astype(np.float64), scan.xyz[inside, 2].astype(np.float64)
-    slope, cell = slope_of_sight(r, z), grid.cell[inside].astype(np.int64)
-    is_ground = (r >= NEAREST) & (r < GROUND_REACH) & (np.abs(z - plane_z) <= tolerance_at(r))
+    x, y, z = scan.xyz[inside].T.astype(np.float64)
+    r, z = grid.r[inside].astype(np.float64), plane.below(x, y, z)
+    slope, cell = slope_of_sight(r, z - plane.height), grid.cell[inside].astype(np.int64)
+    is_ground = (r >= NEAREST) & (r < GROUND_REACH) & (np.abs(z) <= tolerance_at(r))
     shape = grid.n_segments, grid.n_bins
     nearer = _nearer_about(slope[is_ground], cell[is_ground], shape, N_ASIDE)[cell]
     # Only a line of sight that points down meets the plane: at its height over its slope.
-    can_be = (nearer < 0.0) & ((slope - nearer) * plane_z > OVER_SIGHT * nearer)
-    can_be &= (r >= NEAREST) & (r < IMAGE_REACH) & (z < plane_z + DEEP)
+    can_be = (nearer < 0.0) & ((nearer - slope) * plane.height > OVER_SIGHT * nearer)
+    can_be &= (r >= NEAREST) & (r < IMAGE_REACH) & (z < DEEP)
     low = np.flatnonzero(can_be)
     bare = np.flatnonzero(is_ground & (slope >= nearer))
     extremes = scan.tiles.extremes[scan.tiles.tile[inside[bare]]]
@@ -97,7 +99,7 @@ def find_mirror_images(scan: Scan, pose: SensorPose, view: View | None) -> Mirro
         tells = bare[~is_image[bare]]
         before = _ground_before(z[tells], cell[tells], shape)[cell[low]]
         is_seen = np.isfinite(before)
-        mirror_z = np.where(is_seen, before, plane_z)
+        mirror_z = np.where(is_seen, before, 0.0)
         is_image[low] = is_deep = z[low] < mirror_z - np.where(is_seen, BELOW, DEEP)
     rise = 2.0 * (mirror_z - z[low])
     return MirrorImages(inside[low[is_deep]], rise[is_deep])
@@ -108,7 +110,8 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     """Share of what is deep below a plane that is the image of another return; 0 if little is.
 
     A wet road mirrors what stands on it: raised over the road again, its image meets other returns
-    of it. What is seen of a valley, or below a table or a dock, meets none.
+    of it, and the ray to it passes below a nearer return of the road. What is seen of a valley
+    meets none; the floor between tables, or round a dock, is seen past them.
     """
     candidates = scan.candidates
     over = plane.below(candidates.x, candidates.y, candidates.z)
@@ -136,7 +139,8 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     has_return[index[inside]] = True
     around = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 3) @ strides
     boxes = ((raised - low) / COUNTERPART).astype(np.int64) @ strides
-    return float(has_return[np.add.outer(boxes, around)].any(axis=1).mean())
+    has_counterpart = has_return[np.add.outer(boxes, around)].any(axis=1)
+    return float((has_counterpart & ~_is_in_sight(candidates, is_on_it, 0)[deep]).mean())
 
 
 def in_sight(candidates: Candidates) -> Candidates:
@@ -145,12 +149,18 @@ def in_sight(candidates: Candidates) -> Candidates:
     Mirror images may be the lowest returns of most cells: a plane through these is that of a
     ceiling, or of nothing.
     """
+    is_below = candidates.z < 0.0
+    tells = is_below & (candidates.r >= NEAREST)
+    return candidates.where(is_below & _is_in_sight(candidates, tells, 1))
+
+
+def _is_in_sight(candidates: Candidates, tells: BoolArray, n_aside: int) -> BoolArray:
+    """Whether no ray to a candidate passes below a nearer one that `tells`, (C,), there or aside."""
     slope = slope_of_sight(candidates.r, candidates.z)
     shape = candidates.n_segments, int(candidates.bin.max(initial=0)) + 1
     cell = candidates.segment * shape[1] + candidates.bin
-    tells = np.flatnonzero((candidates.r >= NEAREST) & (slope < 0.0))
-    nearer = _nearer_about(slope[tells], cell[tells], shape, 1)[cell]
-    return candidates.where((slope < 0.0) & (slope >= nearer))
+    nearer = _nearer_about(slope[tells], cell[tells], shape, n_aside)
+    return np.asarray(slope >= nearer[cell])
 
 
 def slope_of_sight(r: FloatArray, z: FloatArray) -> FloatArray:
