@@ -235,7 +235,9 @@ def _is_at_edge(scan: Scan, is_on: BoolArray) -> bool:
 
     `is_on` (C,) are the candidates on the plane.
     """
-    c, z = scan.candidates, scan.xyz[scan.grid.inside, 2]
+    c, z = scan.candidates, scan.xyz[:, 2]
+    low = np.flatnonzero(z < c.z.min() + LAYERS[-1])
+    z = z[low[scan.grid.cell[low] >= 0]]
     first, *layers = (np.count_nonzero(z < c.z.min() + layer) for layer in LAYERS)
     shares = layers[0] / layers[1], layers[1] / layers[2]
     is_edge = first >= max(LEAST_LOWEST, LOWEST_SHARE * layers[1])

@@ -74,9 +74,10 @@ def find_mirror_images(scan: Scan, pose: SensorPose, view: View | None) -> Mirro
     above the line of sight to ground that is seen nearer. Where rays start must be known, or
     nothing is told. `view` is the plane that the pose was estimated from, if there is one.
     """
-    grid, plane = scan.grid, pose.plane
-    if not pose.starts_rays or plane.height <= 0.0 or (view is not None and view.is_dry):
+    grid = scan.grid
+    if not pose.starts_rays or pose.sensor_height <= 0.0 or (view is not None and view.is_dry):
         return NO_IMAGES
+    plane = pose.plane
     is_mirror = view is not None and view.is_mirror and pose.height_estimated
     if not is_mirror and mirror_share(plane, scan) < MIRRORED:
         return NO_IMAGES
@@ -94,15 +95,11 @@ def find_mirror_images(scan: Scan, pose: SensorPose, view: View | None) -> Mirro
     bare = np.flatnonzero(is_ground & (slope >= nearer))
     extremes = scan.tiles.extremes[scan.tiles.tile[inside[bare]]]
     bare = bare[extremes[:, 1] - extremes[:, 0] < 2.0 * DEEP]  # where nothing stands
-    is_image = np.zeros(len(z), dtype=np.bool_)
-    for _ in range(2):  # the second time without images that count as ground the first time
-        tells = bare[~is_image[bare]]
-        before = _ground_before(z[tells], cell[tells], shape)[cell[low]]
-        is_seen = np.isfinite(before)
-        mirror_z = np.where(is_seen, before, 0.0)
-        is_image[low] = is_deep = z[low] < mirror_z - np.where(is_seen, BELOW, DEEP)
-    rise = 2.0 * (mirror_z - z[low])
-    return MirrorImages(inside[low[is_deep]], rise[is_deep])
+    before = _ground_before(z[bare], cell[bare], shape)[cell[low]]
+    is_seen = np.isfinite(before)
+    mirror_z = np.where(is_seen, before, 0.0)
+    is_deep = z[low] < mirror_z - np.where(is_seen, BELOW, DEEP)
+    return MirrorImages(inside[low[is_deep]], 2.0 * (mirror_z - z[low])[is_deep])
 
 
 @np.errstate(invalid='ignore', over='ignore')
