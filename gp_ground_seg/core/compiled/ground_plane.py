@@ -8,26 +8,15 @@ from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import (
-    CLEARLY_OFF,
-    LEAST_REACH,
     Plane,
-    crossing_of,
-    distance,
     fit_plane,
     is_possible,
     levelness,
-    refutation_by,
     solve_plane,
     support_by,
     tukey_weight,
 )
-from gp_ground_seg.core.pipeline.lowest_points import (
-    N_CELLS,
-    N_RINGS,
-    N_SECTORS,
-    RING_EDGES,
-    LowestPoints,
-)
+from gp_ground_seg.core.pipeline.lowest_points import LowestPoints
 
 
 @compiled_form(ground_plane.supports_of)
@@ -48,28 +37,6 @@ def _support_of(plane: Plane, cells: LowestPoints, weight: FloatArray) -> float:
     for c in range(len(x)):
         total += support_by(x[c], y[c], z[c], inverse[c], weight[c], plane)
     return total
-
-
-@compiled_form(ground_plane.refutation_of)
-def refutation_of(plane: Plane, cells: LowestPoints) -> float:
-    """Weight of the rays that cross a plane where it should have stopped them."""
-    x, y, z, r = cells.x, cells.y, cells.z, cells.r
-    is_seen, reach = np.zeros(N_CELLS, dtype=np.bool_), np.full(N_SECTORS, LEAST_REACH)
-    for c in range(len(x)):
-        if abs(distance(x[c], y[c], z[c], plane) * cells.inverse[c]) < 1.0:
-            is_seen[cells.cell[c]] = True
-            # The farthest is the last of a sector.
-            reach[cells.cell[c] // N_RINGS] = max(r[c], LEAST_REACH)
-    refutation = 0.0
-    for c in range(len(x)):
-        height = distance(x[c], y[c], z[c], plane)
-        if height * cells.inverse[c] < -CLEARLY_OFF and not cells.is_alone[c]:
-            crossing = crossing_of(r[c], height, plane)
-            sector = cells.cell[c] // N_RINGS
-            ring = np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
-            if crossing < reach[sector] and not is_seen[sector * N_RINGS + ring]:
-                refutation += refutation_by(crossing)
-    return refutation
 
 
 @compiled_form(ground_plane.refine)

@@ -350,6 +350,7 @@ def refutation_by(crossing: Values) -> Values:
     return np.floor(REFUTATION * RESOLUTION * nearness(crossing))
 
 
+@shared
 def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     """Weight of the rays that cross a plane where it should have stopped them; a whole number.
 
@@ -358,18 +359,19 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     dock rays pass. A cell with a point on the plane has stopped rays: what crosses there is a
     mirror image on a wet road. Roofs of cars, and tables, are crossed next to the sensor.
     """
-    height = distance(cells.x, cells.y, cells.z, plane)
-    d, sector = height * cells.inverse, cells.cell // N_RINGS
-    is_on, is_below = np.abs(d) < 1.0, (d < -CLEARLY_OFF) & ~cells.is_alone
+    r, cell, height = cells.r, cells.cell, distance(cells.x, cells.y, cells.z, plane)
     is_seen, reach = np.zeros(N_CELLS, dtype=np.bool_), np.full(N_SECTORS, LEAST_REACH)
-    is_seen[cells.cell[is_on]] = True
-    # The farthest is the last of a sector.
-    reach[sector[is_on]] = np.maximum(cells.r[is_on], LEAST_REACH)
-    sector = sector[is_below]
-    crossing = crossing_of(cells.r[is_below], height[is_below], plane)
-    crossed = sector * N_RINGS + np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
-    counts = (crossing < reach[sector]) & ~is_seen[crossed]
-    return float(refutation_by(crossing[counts]).sum())
+    for c in np.flatnonzero(np.abs(height * cells.inverse) < 1.0):
+        is_seen[cell[c]] = True
+        # The farthest is the last of a sector.
+        reach[cell[c] // N_RINGS] = max(r[c], LEAST_REACH)
+    refutation = 0.0
+    for c in np.flatnonzero((height * cells.inverse < -CLEARLY_OFF) & ~cells.is_alone):
+        crossing, sector = crossing_of(r[c], height[c], plane), cell[c] // N_RINGS
+        ring = np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
+        if crossing < reach[sector] and not is_seen[sector * N_RINGS + ring]:
+            refutation += refutation_by(crossing)
+    return refutation
 
 
 def refine(
