@@ -210,11 +210,8 @@ def find_edges(
 
 
 def _with_neighbours(r: FloatArray) -> FloatArray:
-    """Ranges in sectors, where one that is farther than both its neighbours has theirs [m].
-
-    Noise hides the nearest fall from one sector, whose next fall is farther.
-    """
-    return np.minimum(r, np.median([np.roll(r, 1), r, np.roll(r, -1)], axis=0))
+    """Ranges in sectors; where noise hides the nearest fall from one, that of a neighbour [m]."""
+    return np.asarray(np.minimum(r, np.median([np.roll(r, 1), r, np.roll(r, -1)], axis=0)))
 
 
 def standing_level(xyz: FloatArray, height: float) -> FloatArray:
