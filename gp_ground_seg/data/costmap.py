@@ -104,7 +104,7 @@ class SegmentedCloud:
             return self.places(self.is_obstacle)
         edges, pose, heading = self._found, self.segmentation.pose, self._rotation[:2, :2]
         stands = self.places(self.is_obstacle & ~edges.is_before)
-        both = zip(stands, self._in_plane(*self.edges.T), strict=True)
+        both = zip(stands, self._in_plane(*self._in_cloud(edges.points()).T), strict=True)
         x, y = (np.concatenate([a, b.astype(a.dtype)]) for a, b in both)
         ahead, left, _ = pose.origin
         level = np.full(SECTORS, -pose.sensor_height)
@@ -117,16 +117,6 @@ class SegmentedCloud:
             x, y, lambda x, y: edges.hides(*(heading @ np.stack([x - ahead, y - left]))),
             first, behind,
         )  # fmt: skip
-
-    @cached_property
-    def edges(self) -> FloatArray:
-        """Points along the edges of drops, (n, 3) in the frame of the cloud [m].
-
-        Where ``output.max_step_down`` is 0, none are looked for.
-        """
-        if self.config.output.max_step_down == 0.0:
-            return np.empty((0, 3))
-        return self._in_cloud(self._found.points())
 
     @cached_property
     def _rotation(self) -> FloatArray:

@@ -65,7 +65,7 @@ way over its edge; where that is never seen, than this share of the lowest line 
 LEAST_FALL, LEAST_HIDDEN = 0.02, 0.3  # that hides ground, and least length of what is hidden [m]
 FOOT = 0.01  # range of the ground that the robot stands on [m]
 MAX_SLOPE = 0.3  # steepest slope that is seen to lead down from the robot
-ON_LEVEL = 0.1  # what is nearer to the level before a fall is ground, whatever its label [m]
+ON_LEVEL = 0.1  # noise: what is nearer to the level before a fall is ground, by any label [m]
 BIN, N_BINS = 0.1, 500  # width [m] and number of the bins of range in which ground is hidden
 SAMPLES, SPACING = 8, 0.04
 """Points along an edge in a sector, and their distance along the line between two of them [m]: at
@@ -178,17 +178,18 @@ def find_edges(
     steps = _steps(returns, *_falls(returns, max_step_down), max_step_down)
     every, hiding = np.arange(SECTORS), steps.where(~steps.is_on_slope)
     _hide(edges, returns, hiding, max_step_down)
+    edges.first[:] = _with_neighbours(edges.first)
     # Where the first return is behind a fall, and its line of sight less steep than a ramp.
-    blind = hiding.sector[(hiding.near == FOOT) & (hiding.slope < STEEPEST)]
-    is_blind = np.isin(every, blind)
+    is_blind = np.isin(every, hiding.sector[(hiding.near == FOOT) & (hiding.slope < STEEPEST)])
     is_seen = ~is_blind[steps.sector] & (steps.near > FOOT)
     steps = steps.where((steps.fall > WEAK * max_step_down) & is_seen)
-    sector, lowest = np.unique(steps.sector, return_index=True)
-    if not len(sector):
+    if not len(steps.sector):
         return edges
+    sector, lowest = np.unique(steps.sector, return_index=True)
     steps = steps.where(lowest)
     # Where the line of sight over the edge meets the upper ground, if that went on.
     far = np.maximum(steps.near, -returns.z[steps.upper] / steps.slope)
+    steps = steps._replace(near=_with_neighbours(steps.near))
     gap, group = _group(steps, far, is_blind)
     # In each sector from a step up to the next of its edge: as near as the nearer of the two, or,
     # if it is blind, on the line between them.
@@ -206,6 +207,11 @@ def find_edges(
             edges.r[kept], edges.z[kept] = r[kept], returns.z[steps.upper[step[kept]]]
             edges.goes_on[kept] = gap[step[kept]] > 0
     return edges
+
+
+def _with_neighbours(r: FloatArray) -> FloatArray:
+    """Ranges in sectors; where noise hides the nearest fall from one, that of a neighbour [m]."""
+    return np.asarray(np.minimum(r, np.median([np.roll(r, 1), r, np.roll(r, -1)], axis=0)))
 
 
 def standing_level(xyz: FloatArray, height: float) -> FloatArray:
@@ -339,7 +345,7 @@ def _steps(
     fall = np.where(is_first, z[upper] - z[deep], fall)
     sight = returns.sight[lower]
     steps = _Steps(upper, deep, sector[upper], r[upper], fall, sight, is_on_slope)
-    return steps.where(fall > np.where(is_first, max_step_down, LEAST_FALL))
+    return steps.where(fall > np.where(is_first, WEAK * max_step_down, LEAST_FALL))
 
 
 def _is_mirrored(returns: _Returns, upper: IntArray) -> BoolArray:
@@ -400,15 +406,15 @@ class _Ground(NamedTuple):
 def _group(steps: _Steps, far: FloatArray, is_blind: BoolArray) -> tuple[IntArray, IntArray]:
     """Sectors from each step to the next of its edge, or 0 at its end; number of its edge.
 
-    Steps are by sector. The edge is between them and `far` [m]: those of an edge overlap, but
-    for what it recedes from sector to sector. Sectors whose first return `is_blind`, behind a
-    fall, do not count: an edge on both sides of them goes on through them.
+    Steps are by sector. The edge is between them and `far` [m]: those of an edge overlap, but for
+    noise, and what it recedes from sector to sector. Sectors whose first return `is_blind`, behind
+    a fall, do not count: an edge on both sides of them goes on through them.
     """
     sector, near = steps.sector, steps.near
     gap = (np.roll(sector, -1) - sector) % SECTORS
     n_seen = np.cumsum(np.tile(~is_blind, 2))
     apart: IntArray = n_seen[sector + gap] - n_seen[sector]
-    outer = np.minimum(far, np.roll(far, -1)) * (1.0 + SAME_EDGE * apart)
+    outer = np.minimum(far, np.roll(far, -1)) * (1.0 + SAME_EDGE * apart) + ON_LEVEL
     is_near = (apart <= MAX_APART) & (gap > 0) & (2 * gap < SECTORS)
     joined: BoolArray = is_near & (np.maximum(near, np.roll(near, -1)) <= outer)
     ends = np.flatnonzero(~joined)

@@ -143,8 +143,8 @@ class GroundSegmentationNode(ConfiguredNode):
             self._refuse(cloud, error)
             return
         publishing, waited = time.monotonic() - segmented, frames.waited
-        before = {'queue': start - arrival - waited, 'frames': waited}
-        stages = {**before, **result.timings, 'publish': publishing}
+        stages = {'queue': start - arrival - waited, 'frames': waited, **result.timings}
+        stages['publish'] = publishing
         self._diagnostics.published(result, arrival, stages, frames.age)
 
     def _why_idle(self) -> str:

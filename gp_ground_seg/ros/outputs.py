@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -43,8 +44,7 @@ horizontal range of the knot in the level frame, and, equal in all points, the a
 cloud's frame into the level one, and the place of the sensor in it."""
 OUTPUT_DEPTH = 20  # messages kept: Fast DDS may send a lost fragment again after 0.7 s only
 MAP_LIFESPAN = 0.9  # a grid for a reader that comes later has been sent so long ago at most [s]
-LONGEST_PERIOD = 1.0
-"""Time between two clouds [s] from which on some are missing: ``scan_time`` is 0 then."""
+LONGEST_PERIOD = 1.0  # between two clouds [s]: from then on some are missing, ``scan_time`` is 0
 
 
 class Output(NamedTuple):
@@ -184,7 +184,11 @@ class OutputPublishers:
     _stamp = math.inf  # of the last cloud [s]
 
     def __init__(self, node: Node) -> None:
-        options = {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
+        options = {
+            'qos_overriding_options': QoSOverridingOptions.with_default_policies(),
+            # The executor would wait for the events of each anew. A subscriber is told, too.
+            'event_callbacks': PublisherEventCallbacks(use_default_callbacks=False),
+        }
         self._publishers = [
             # A copy: rclpy writes qos_overrides of this node into it.
             (o, node.create_publisher(o.message_type, o.topic, copy(o.profile), **options))

@@ -128,7 +128,7 @@ def test_what_a_costmap_takes_is_that_of_the_library(b):
         parts = b.segment(message)
         scan, grid = (received(b, topic, message) for topic in ('~/scan', '~/occupancy'))
     assert all(one.header == message.header for one in (*parts, scan, grid))
-    assert expected.is_obstacle.sum() > 300 and len(expected.edges) > 100
+    assert expected.is_obstacle.sum() > 300 and len(expected._found.points()) > 100
     for part, chosen in zip(parts, (expected.is_ground, expected.is_obstacle), strict=True):
         assert ros.rows_of(part) == [rows[k] for k in np.flatnonzero(chosen)]
 
