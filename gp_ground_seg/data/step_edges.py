@@ -189,7 +189,9 @@ def find_edges(
     steps = steps.where(lowest)
     # Where the line of sight over the edge meets the upper ground, if that went on.
     far = np.maximum(steps.near, -returns.z[steps.upper] / steps.slope)
-    steps = steps._replace(near=_with_neighbours(steps.near))
+    near = np.full(SECTORS, np.inf)
+    near[steps.sector] = steps.near
+    steps = steps._replace(near=_with_neighbours(near)[steps.sector])
     gap, group = _group(steps, far, is_blind)
     # In each sector from a step up to the next of its edge: as near as the nearer of the two, or,
     # if it is blind, on the line between them.
