@@ -53,9 +53,11 @@ def find_faces(
             shows_ground[t] |= is_foot and is_flat(scan.extent[cell], tolerance)
     tall, tile_to_row = _select_tall(tiles, height, label)
     sums = _sum_returns(scan.xyz, tiles, tall, config.cell_size, height, label, tile_to_row)
-    whole = sums[::2, :SUMS] + sums[1::2, :SUMS]
+    whole = np.empty((len(tall), SUMS))
     for k in range(len(tall)):
         t, low, high = np.uintp(tall[k]), sums[2 * k], sums[2 * k + 1]
+        for i in range(SUMS):
+            whole[k, i] = low[i] + high[i]
         extent = np.float64(tiles.extremes[t, 1]) - np.float64(tiles.extremes[t, 0])
         if extent > face_height(label):
             faces.is_face[t] = is_face = is_vertical(whole[k], config)
