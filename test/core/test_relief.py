@@ -20,19 +20,15 @@ NO_FACES = Faces(*np.zeros((3, N_TILES), dtype=bool))
 def candidates_on(height, ranges, n_segments=180, seed=0, share=1.0, spread=0.3):
     """Candidates on ground of a `height` over x and y, or a share of them."""
     rng = np.random.default_rng(seed)
-    segment, r = (
-        grid.ravel() for grid in np.meshgrid(np.arange(n_segments), ranges, indexing='ij')
-    )
+    segment, r = np.repeat(np.arange(n_segments), len(ranges)), np.tile(ranges, n_segments)
     kept = rng.uniform(size=len(r)) < share
     segment, r = segment[kept], r[kept]
-    azimuth = (
-        2.0 * np.pi * (segment + 0.5 + spread * rng.uniform(-1.0, 1.0, len(r))) / n_segments
-        - np.pi
-    )
+    turn = (segment + 0.5 + spread * rng.uniform(-1.0, 1.0, len(r))) / n_segments
+    azimuth = 2.0 * np.pi * turn - np.pi
     x, y = r * np.cos(azimuth), r * np.sin(azimuth)
     offsets = np.concatenate([[0], np.cumsum(np.bincount(segment, minlength=n_segments))])
-    tile = np.arange(len(r), dtype=np.int32)  # one for each, unless a test has others
-    z = height(x, y) - HEIGHT
+    # A tile for each, unless a test has others.
+    z, tile = height(x, y) - HEIGHT, np.arange(len(r), dtype=np.int32)
     return Candidates(r, z, np.arange(len(r)), np.ones(len(r)), offsets, tile, x, y)
 
 
@@ -59,8 +55,7 @@ def test_backends_find_one_relief(compiled_code, seed, n_segments, looks_aside):
     config = Config().replace(**{'surface.look_aside': looks_aside})
     found = [backend.find_relief(candidates, faces, HEIGHT, config) for backend in BACKENDS]
     np.testing.assert_allclose(found[0][0].pieces, found[1][0].pieces, rtol=1e-7, atol=1e-7)
-    for ours, theirs in zip(found[0][2], found[1][2], strict=True):
-        np.testing.assert_array_equal(ours, theirs)
+    np.testing.assert_array_equal(found[0][2], found[1][2])
     for relief, over, _ in found:
         lift = relief.at(candidates.x, candidates.y)
         np.testing.assert_allclose(over.z, candidates.z - lift, rtol=1e-7, atol=1e-7)

@@ -53,15 +53,18 @@ def find_faces(
             shows_ground[t] |= is_foot and is_flat(scan.extent[cell], tolerance)
     tall, tile_to_row = _select_tall(tiles, height, label)
     sums = _sum_returns(scan.xyz, tiles, tall, config.cell_size, height, label, tile_to_row)
+    whole = np.empty((len(tall), SUMS))
     for k in range(len(tall)):
         t, low, high = np.uintp(tall[k]), sums[2 * k], sums[2 * k + 1]
+        for i in range(SUMS):
+            whole[k, i] = low[i] + high[i]
         extent = np.float64(tiles.extremes[t, 1]) - np.float64(tiles.extremes[t, 0])
         if extent > face_height(label):
-            faces.is_face[t] = is_face = is_vertical(low, high, config)
+            faces.is_face[t] = is_face = is_vertical(whole[k], config)
             faces.is_steep[t] = is_steep(high)
             is_occluded = is_face and not shows_ground[t] and is_base_occluded(low, high, config)
             faces.has_occluded_base[t] = is_occluded
-    _mark_scattered(tiles, tall, sums, height, label, faces)
+    _mark_scattered(tiles, tall, whole, height, label, faces)
     for m in range(len(candidates.offsets) - 1):
         before = 0.0
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
@@ -80,28 +83,25 @@ def _mark_scattered(
     label: LabelConfig,
     faces: Faces,
 ) -> None:
-    """Mark raised tiles about which many scatter. See the plain `vote_on_scatter`."""
+    """Mark raised tiles about which many scatter, by the sums (K, SUMS) of those to examine."""
     n, n_own, face, n_sides = 0, 0, face_height(label), int(math.sqrt(len(tiles.at)))
-    raised, own, whole = np.empty_like(tall), np.empty(len(tall)), np.empty((len(tall), SUMS))
-    square = np.empty(len(tall))
+    raised, own, square = np.empty_like(tall), np.empty(len(tall)), np.empty(len(tall))
     for k in range(len(tall)):
         t = np.uintp(tall[k])
         low, high = np.float64(tiles.extremes[t, 0]), np.float64(tiles.extremes[t, 1])
         if faces.is_face[t]:
             continue
         if low + height > 0.5 * face:
-            raised[n], square[n] = t, scatter_square(sums[2 * k], sums[2 * k + 1])
-            for i in range(SUMS):
-                whole[n, i] = sums[2 * k, i] + sums[2 * k + 1, i]
+            raised[n], square[n] = k, scatter_square(sums[k])
             n += 1
         elif low + height > -0.5 * face and high - low <= face:
-            own[n_own] = scatter_square(sums[2 * k], sums[2 * k + 1])
+            own[n_own] = scatter_square(sums[k])
             n_own += 1
     _, counts = levels_of(own[:n_own], SQUARE_SCATTERS)
     limit = smooth_up_to(SCATTER[level_at(counts, counts.sum(), OWN_SHARE)])
-    raised, level = raised[:n], np.empty(n, np.int32)
+    sums, raised, level = sums[raised[:n]], tall[raised[:n]], np.empty(n, np.int32)
     place = tiles.place[raised]
-    block, places, blocks, small = _merged(place, n_sides, whole[:n])
+    block, places, blocks, small = _merged(place, n_sides, sums)
     wide_block, _, _, large = _merged(places, (n_sides + 1) // 2, blocks)
     for k in range(n):
         b = np.uintp(block[k])
@@ -124,7 +124,7 @@ def _merged(
     """
     width, n = (n_sides + 1) // 2, 0
     number, block, places = np.zeros(width * width, np.int32), np.empty_like(place), place.copy()
-    blocks, square, none = np.empty_like(sums), np.empty(len(sums)), np.zeros(SUMS)
+    blocks, square = np.empty_like(sums), np.empty(len(sums))
     for k in range(len(place)):
         # A division of whole numbers takes longer.
         column = np.int32((place[k] + 0.5) / n_sides)
@@ -137,7 +137,7 @@ def _merged(
         for i in range(SUMS):
             blocks[block[k], i] += sums[k, i]
     for b in range(n):
-        square[b] = slope_square(blocks[b], none)
+        square[b] = slope_square(blocks[b])
     return block, places[:n], blocks[:n], square
 
 

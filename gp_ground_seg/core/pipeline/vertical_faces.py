@@ -105,13 +105,13 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     is_rest = above > label.ground_tolerance
     sums = _sums(x, y, z, row + len(tall) * is_rest, 2 * len(tall))
     foot, rest = sums[:, : len(tall)], sums[:, len(tall) :]
-    reaches = extent > face_height(label)
-    result.is_face[tall] = reaches & is_vertical(foot, rest, faces)
+    whole, reaches = foot + rest, extent > face_height(label)
+    result.is_face[tall] = reaches & is_vertical(whole, faces)
     result.is_steep[tall] = reaches & is_steep(rest)
     result.has_occluded_base[tall] = result.is_face[tall] & is_base_occluded(foot, rest, faces)
     result.has_occluded_base[_with_flat_foot(scan, label.ground_tolerance)] = False
     is_face, place = result.is_face[tall], tiles.place[tall]
-    rough = tall[_scattered(place, n_sides, foot + rest, is_face, extent, over, label)]
+    rough = tall[_scattered(place, n_sides, whole, is_face, extent, over, label)]
     result.is_face[rough] = result.has_occluded_base[rough] = True
     candidates = scan.candidates
     is_next = np.diff(candidates.segment, prepend=-1) == 0
@@ -144,9 +144,11 @@ def _scattered(
 
     `sums`, (SUMS, K), are over their returns; for the others see `is_examined`.
     """
-    square, face = scatter_square(sums, np.zeros_like(sums)), face_height(label)
+    square, face = scatter_square(sums), face_height(label)
     is_own = ~is_face & (np.abs(over) < 0.5 * face) & (extent <= face)
-    limit = _limit_of(square[is_own])
+    level = np.searchsorted(SQUARE_SCATTERS, square[is_own & (square != UNKNOWN)], side='right')
+    counts = np.bincount(level, minlength=N_LEVELS)[None, :]
+    limit = smooth_up_to(SCATTER[level_at(counts, OWN_SHARE)[0]])
     raised = np.flatnonzero(~is_face & (over > 0.5 * face))
     place = place[raised]
     small, large = (_squares_of_blocks(place, n_sides, sums[:, raised], n) for n in (1, 2))
@@ -154,13 +156,6 @@ def _scattered(
     about = levels_about(place, vote, n_sides, SCATTERED, 0)
     result: IntArray = raised[(vote != UNKNOWN_LEVEL) & (about > 0) & (over[raised] > face)]
     return result
-
-
-def _limit_of(square: FloatArray) -> float:
-    """Largest scatter of smooth terrain, by squares of those of the own level, (K,) [m]."""
-    level = np.searchsorted(SQUARE_SCATTERS, square[square != UNKNOWN], side='right')
-    counts = np.bincount(level, minlength=N_LEVELS)[None, :]
-    return float(smooth_up_to(SCATTER[level_at(counts, OWN_SHARE)[0]]))
 
 
 def _squares_of_blocks(place: CellArray, n_sides: int, sums: FloatArray, shift: int) -> FloatArray:
@@ -171,7 +166,7 @@ def _squares_of_blocks(place: CellArray, n_sides: int, sums: FloatArray, shift: 
     column, row = np.divmod(as_index(place), n_sides)
     block = (column >> shift) * n_sides + (row >> shift)
     blocks = np.array([np.bincount(block, total)[block] for total in sums])
-    square: FloatArray = slope_square(blocks, np.zeros_like(blocks))
+    square: FloatArray = slope_square(blocks)
     return square
 
 
@@ -232,24 +227,24 @@ def _sums(x: FloatArray, y: FloatArray, z: FloatArray, row: IntArray, n_rows: in
 
 
 @shared
-def moments(foot: FloatArray, rest: FloatArray) -> tuple[Values, ...]:
+def moments(sums: FloatArray) -> tuple[Values, ...]:
     """Return the number of returns, and that times their scatter xx, yy, zz, xy, xz, yz [m^2].
 
-    `foot` and `rest` are the sums over the lowest returns of a tile and those above, (SUMS,),
-    or (SUMS, T) of T tiles; coordinates are relative to any point of the tile [m].
+    The sums are over the returns of a tile, (SUMS,), or (SUMS, T) of T tiles; coordinates are
+    relative to any point of the tile [m].
     """
-    n, x, y, z = foot[0] + rest[0], foot[1] + rest[1], foot[2] + rest[2], foot[3] + rest[3]
+    n, x, y, z = sums[0], sums[1], sums[2], sums[3]
     inverse = 1.0 / n  # one division, which takes as long as ten multiplications
     mx, my, mz = x * inverse, y * inverse, z * inverse
-    xx, yy, zz = foot[4] + rest[4] - mx * x, foot[5] + rest[5] - my * y, foot[6] + rest[6] - mz * z
-    xy, xz, yz = foot[7] + rest[7] - mx * y, foot[8] + rest[8] - mx * z, foot[9] + rest[9] - my * z
+    xx, yy, zz = sums[4] - mx * x, sums[5] - my * y, sums[6] - mz * z
+    xy, xz, yz = sums[7] - mx * y, sums[8] - mx * z, sums[9] - my * z
     return n, xx, yy, zz, xy, xz, yz
 
 
 @shared
-def is_vertical(foot: FloatArray, rest: FloatArray, faces: FacesConfig) -> Values:
+def is_vertical(sums: FloatArray, faces: FacesConfig) -> Values:
     """Whether the returns of a tile form a vertical face; for the sums see `moments`."""
-    n, xx, yy, zz, xy, xz, yz = moments(foot, rest)
+    n, xx, yy, zz, xy, xz, yz = moments(sums)
     return (n >= MIN_RETURNS) & (normal_z(xx, yy, zz, xy, xz, yz) < faces.max_normal_z)
 
 
@@ -267,14 +262,14 @@ def is_steep(rest: FloatArray) -> Values:
 
 
 @shared
-def scatter_square(foot: FloatArray, rest: FloatArray) -> Values:
+def scatter_square(sums: FloatArray) -> Values:
     """Mean square of the returns of a tile about the plane through them [m^2].
 
     It is the determinant of their scatter over the sum of its minors: nearly the least eigenvalue,
     as the two others are larger. `UNKNOWN` of few returns, and of those in a line.
     For the sums see `moments`.
     """
-    n, xx, yy, zz, xy, xz, yz = moments(foot, rest)
+    n, xx, yy, zz, xy, xz, yz = moments(sums)
     a, b, c = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
     minors = a + b + c
     determinant = xx * a - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
@@ -284,12 +279,12 @@ def scatter_square(foot: FloatArray, rest: FloatArray) -> Values:
 
 
 @shared
-def slope_square(sums: FloatArray, none: FloatArray) -> Values:
+def slope_square(sums: FloatArray) -> Values:
     """Do what `scatter_square` does, of returns as steep as stairs; `UNKNOWN` of others."""
-    _, xx, yy, zz, xy, xz, yz = moments(sums, none)
+    _, xx, yy, zz, xy, xz, yz = moments(sums)
     up = normal_z(xx, yy, zz, xy, xz, yz)
     is_as_steep = (up > STAIRS_UP[0]) & (up < STAIRS_UP[1])
-    return choose(is_as_steep, scatter_square(sums, none), UNKNOWN)
+    return choose(is_as_steep, scatter_square(sums), UNKNOWN)
 
 
 @shared
@@ -298,10 +293,13 @@ def vote_on_scatter(square: Values, small: Values, large: Values, limit: float) 
 
     Squares of the scatter are of the tile, and of blocks of 1 and 2 m [m^2]. A tile of stairs may
     show one step alone, but a block scatters as much as one twice as large: both lie on one plane.
+    With one ring a step 1 m may be smooth; where 2 m scatter as stairs do, that tells nothing.
     """
-    even = np.minimum(STEPS * STEPS, AS_EVEN * AS_EVEN * small)
-    is_stepped = (small > SMOOTH * SMOOTH) & (large > 0.0) & (large < even)
-    is_smooth = (square != UNKNOWN) | ((small != UNKNOWN) & (small <= SMOOTH * SMOOTH))
+    smooth, steps = SMOOTH * SMOOTH, STEPS * STEPS
+    even = np.minimum(steps, AS_EVEN * AS_EVEN * small)
+    is_stepped = (small > smooth) & (large > 0.0) & (large < even)
+    is_block_smooth = (small != UNKNOWN) & (small <= smooth)
+    is_smooth = (square != UNKNOWN) | (is_block_smooth & ((large <= smooth) | (large >= steps)))
     return choose(is_stepped | (square > limit * limit), 1, choose(is_smooth, 0, UNKNOWN_LEVEL))
 
 
@@ -329,7 +327,7 @@ def normal_z(xx: Values, yy: Values, zz: Values, xy: Values, xz: Values, yz: Val
 def is_base_occluded(foot: FloatArray, rest: FloatArray, faces: FacesConfig) -> Values:
     """Whether the lowest returns of a tile belong to its face, and are not ground before it.
 
-    Ground would lie off the plane of the returns above. Sums are those of `is_vertical`. False
+    Ground would lie off the plane of the returns above. For the sums see `moments`. False
     where fewer than two returns are above the foot.
     """
     n_foot, n_rest = foot[0], np.maximum(rest[0], 1.0)
