@@ -11,7 +11,7 @@ from reference import extract_lines, pseudo_inputs
 
 from gp_ground_seg import Config
 from gp_ground_seg.core.frame import Candidates, Faces
-from gp_ground_seg.core.gp.ground import carries_on, slope_before
+from gp_ground_seg.core.gp.ground import carries_on
 from gp_ground_seg.core.pipeline.lines import (
     deming_slope,
     differs_in_direction,
@@ -19,6 +19,7 @@ from gp_ground_seg.core.pipeline.lines import (
 )
 
 N_TILES = 50
+GROWTH = Config().growth
 NO_FACES = Faces(*np.zeros((3, N_TILES), dtype=bool))
 
 
@@ -120,23 +121,35 @@ AHEAD = {
 
 @pytest.mark.parametrize(('ahead', 'is_followed'), AHEAD.values(), ids=AHEAD)
 def test_the_ground_carries_on_to_a_slope_and_not_to_a_step(backend, ahead, is_followed):
-    candidates = candidates_of(5.0 + 4.0 * np.arange(7), np.append(np.zeros(3), ahead))
-    _, lines, _, onward, _ = backend.extract_lines(candidates, NO_FACES, Config())
-    assert list(lines.start) == [0, 3, 7]
-    rises_on = carries_on(ahead[0], 4.0, onward[3], np.nan)
+    r, z = 5.0 + 4.0 * np.arange(7), np.append(np.zeros(3), ahead)
+    candidates = candidates_of(r, z, offsets=[0, 7, 7])
+    _, lines, _, land, _ = backend.extract_lines(candidates, NO_FACES, Config())
+    assert list(lines.start) == [0, 3, 7] and not land.any()
+    rises_on = carries_on(ahead[0], 4.0, lines.slope[1], 12.0, land[3], GROWTH)
     follows = is_walkable(ahead[0], 4.0, 0.2) and (ahead[0] <= 0.0 or rises_on)
     assert follows == is_followed
     # Where it falls, nothing shows that what is there is ground.
     assert not (rises_on and ahead[0] <= 0.0)
-    assert np.isnan(onward[5:]).all() == is_walkable(ahead[3] - ahead[2], 4.0, 0.2)
-    assert carries_on(0.4, 4.0, onward[6], 0.1) > carries_on(0.4, 4.0, onward[6], 0.05)
+    # Too short a line shows nothing, and land goes on whatever its line is.
+    for on_land in (False, True):
+        short = 0.9 * GROWTH.min_rise_extent
+        assert carries_on(0.4, 4.0, 0.1, short, on_land, GROWTH) == on_land
 
 
-def test_a_line_tells_the_ground_as_far_ahead_as_it_reaches_back():
-    growth = Config().growth
-    extent = np.array([growth.min_rise_extent, 20.0, 20.0, 0.9 * growth.min_rise_extent])
-    told = slope_before(0.1, extent, np.array([1.0, 20.0, 20.1, 1.0]), growth)
-    np.testing.assert_array_equal(told, [0.1, 0.1, np.nan, np.nan])
+@pytest.mark.parametrize(
+    ('number', 'farther', 'higher', 'in_face', 'n_land'),
+    [(10, 0.0, 0.0, False, 0), (12, 0.0, 0.0, False, 12), (22, 1.3, 0.5, False, 22),
+     (22, 1.5, 0.0, False, 18), (22, 0.0, 0.4, False, 18), (22, 0.0, 0.0, True, 18)],
+)  # fmt: skip
+def test_what_goes_on_aside_for_14_m_is_land(backend, number, farther, higher, in_face, n_land):
+    """Segments of 1.4 m from the 176th on, past the end of the ring; the 179th differs."""
+    own, (r, z, tile) = np.arange(175, 175 + number) % 180, np.zeros((3, 180))
+    r[own], r[178], z[178], tile[178] = 40.0, 40.0 + farther, higher, 1
+    there = r > 0.0
+    candidates = candidates_of(r[there], z[there], None, np.append(0, np.cumsum(there)))
+    candidates = candidates._replace(tile=tile[there].astype(np.int32))
+    faces = NO_FACES._replace(is_face=(np.arange(N_TILES) == 1) & in_face)
+    assert backend.extract_lines(candidates, faces, Config())[3].sum() == n_land
 
 
 def test_a_candidate_far_below_changes_no_line_of_other_segments(backend):
