@@ -6,13 +6,7 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gp_ground_seg.data.bags import (
-    POINT_CLOUD2,
-    BagReader,
-    encode_cloud,
-    jazzy_types,
-    new_bag,
-)
+from gp_ground_seg.data.bags import POINT_CLOUD2, BagReader, encode_cloud, jazzy_types, new_bag
 
 START = 1_317_000_000_123_456_789
 PERIOD = 100_000_000

@@ -221,9 +221,7 @@ class Frame(NamedTuple):
     candidates: Candidates
     lines: Lines
     pseudo: PseudoInputs
-    # (C,) slope with which the ground goes on behind a candidate; -inf where it does not; NaN at
-    # the end of its segment
-    onward: FloatArray
+    land: BoolArray  # (C,) whether the ground goes on aside so far that it is no object
     in_face: BoolArray  # (C,) whether the tile of a candidate has a vertical face
     knots: FloatArray  # (K,) ranges where the surface is wanted [m], read-only
     prior_mean: float  # prior mean of the ground's height [m]

@@ -178,11 +178,9 @@ class GroundSegmenter:
         # 4. Relief of the terrain; lines along each segment, over it, without lowest points of
         #    faces with occluded base; pseudo-inputs. The prior mean is the ground near the sensor.
         relief, candidates, shown = backend.find_relief(scan.candidates, faces, height, config)
-        candidates, lines, pseudo, onward, in_face = backend.extract_lines(
-            candidates, faces, config
-        )
+        candidates, lines, pseudo, land, in_face = backend.extract_lines(candidates, faces, config)
         knots, prior_mean = scan.grid.edges, -height
-        frame = Frame(candidates, lines, pseudo, onward, in_face, knots, prior_mean)
+        frame = Frame(candidates, lines, pseudo, land, in_face, knots, prior_mean)
         timer.mark('lines')
         # 5. Observation and latent process: hyper-parameters theta, inliers and surface.
         is_fixed = config.learning.mode == 'fixed'

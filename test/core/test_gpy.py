@@ -48,7 +48,7 @@ def test_the_surface_is_that_of_gpy(backend):
         column('r_bar'), column('log_extent'), offsets('r_bar'), bar, column('kind')
     )
     lines = Lines(place, np.zeros(1), np.array([0, n]))
-    frame = Frame(candidates, lines, pseudo, np.full(n, -np.inf), nowhere, knots, 0.0)
+    frame = Frame(candidates, lines, pseudo, nowhere, nowhere, knots, 0.0)
     surface, knot_u, _ = backend.estimate_surface(frame, THETA, CONFIG)
     assert surface.inlier.all()
     found = np.stack([knot_u, surface.mean, surface.std], axis=1)

@@ -12,12 +12,7 @@ from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.frame import Inliers
 from gp_ground_seg.core.gp import learning
-from gp_ground_seg.core.gp.learning import (
-    Learned,
-    ThetaSpace,
-    given_theta,
-    theta_space,
-)
+from gp_ground_seg.core.gp.learning import Learned, ThetaSpace, given_theta, theta_space
 from gp_ground_seg.core.gp.likelihood import log_likelihood
 from gp_ground_seg.core.jit import JIT_ENABLED
 from gp_ground_seg.core.parameters.config import PRESETS, ObservationConfig

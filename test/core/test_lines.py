@@ -11,15 +11,13 @@ from reference import extract_lines, pseudo_inputs
 
 from gp_ground_seg import Config
 from gp_ground_seg.core.frame import Candidates, Faces
-from gp_ground_seg.core.gp.ground import carries_on, slope_before
-from gp_ground_seg.core.pipeline.lines import (
-    deming_slope,
-    differs_in_direction,
-    is_walkable,
-)
+from gp_ground_seg.core.gp.ground import carries_on
+from gp_ground_seg.core.pipeline.lines import deming_slope, differs_in_direction, is_walkable
 
 N_TILES = 50
+GROWTH = Config().growth
 NO_FACES = Faces(*np.zeros((3, N_TILES), dtype=bool))
+FACES = NO_FACES._replace(is_face=np.arange(N_TILES) > 0)
 
 
 def candidates_of(r, z, density=None, offsets=None):
@@ -120,23 +118,31 @@ AHEAD = {
 
 @pytest.mark.parametrize(('ahead', 'is_followed'), AHEAD.values(), ids=AHEAD)
 def test_the_ground_carries_on_to_a_slope_and_not_to_a_step(backend, ahead, is_followed):
-    candidates = candidates_of(5.0 + 4.0 * np.arange(7), np.append(np.zeros(3), ahead))
-    _, lines, _, onward, _ = backend.extract_lines(candidates, NO_FACES, Config())
-    assert list(lines.start) == [0, 3, 7]
-    rises_on = carries_on(ahead[0], 4.0, onward[3], np.nan)
-    follows = is_walkable(ahead[0], 4.0, 0.2) and (ahead[0] <= 0.0 or rises_on)
-    assert follows == is_followed
+    candidates = candidates_of(5.0 + 4.0 * np.arange(7), np.r_[0, 0, 0, ahead], None, [0, 7, 7])
+    _, lines, _, land, _ = backend.extract_lines(candidates, NO_FACES, Config())
+    assert list(lines.start) == [0, 3, 7] and not land.any()
+    rises_on = carries_on(ahead[0], 4.0, lines.slope[1], 12.0, land[3], GROWTH)
+    assert (is_walkable(ahead[0], 4.0, 0.2) and (ahead[0] <= 0.0 or rises_on)) == is_followed
     # Where it falls, nothing shows that what is there is ground.
     assert not (rises_on and ahead[0] <= 0.0)
-    assert np.isnan(onward[5:]).all() == is_walkable(ahead[3] - ahead[2], 4.0, 0.2)
-    assert carries_on(0.4, 4.0, onward[6], 0.1) > carries_on(0.4, 4.0, onward[6], 0.05)
+    # Too short a line shows nothing, and land goes on whatever its line is.
+    assert [carries_on(0.4, 4.0, 0.1, 2.9, land, GROWTH) for land in (False, True)] == [0, 1]
 
 
-def test_a_line_tells_the_ground_as_far_ahead_as_it_reaches_back():
-    growth = Config().growth
-    extent = np.array([growth.min_rise_extent, 20.0, 20.0, 0.9 * growth.min_rise_extent])
-    told = slope_before(0.1, extent, np.array([1.0, 20.0, 20.1, 1.0]), growth)
-    np.testing.assert_array_equal(told, [0.1, 0.1, np.nan, np.nan])
+@pytest.mark.parametrize(
+    ('number', 'place', 'n_land'),
+    [(11, (40.0, 0.0, 0), 0), (12, (40.0, 0.0, 0), 12), (22, (41.3, 0.5, 0), 22),
+     (22, (41.5, 0.0, 0), 18), (22, (40.0, 0.4, 0), 18), (22, (40.0, 0.0, 1), 18)],
+)  # fmt: skip
+def test_what_goes_on_aside_for_14_m_is_land(backend, number, place, n_land):
+    # Segments of 1.4 m past the end of the ring; the fourth has a place of its own, or a face.
+    table = np.zeros((180, 3))
+    table[np.arange(175, 175 + number) % 180, 0], table[178] = 40.0, place
+    (r, z, tile), is_there = table[table[:, 0] > 0.0].T, table[:, 0] > 0.0
+    candidates = candidates_of(r, z, None, np.append(0, np.cumsum(is_there)))._replace(
+        tile=tile.astype(np.int32)
+    )
+    assert backend.extract_lines(candidates, FACES, Config())[3].sum() == n_land
 
 
 def test_a_candidate_far_below_changes_no_line_of_other_segments(backend):
@@ -154,4 +160,3 @@ def test_a_candidate_far_below_changes_no_line_of_other_segments(backend):
     assert len(own.r) > 50
     np.testing.assert_array_equal(with_it[1].start[2:] - 1, lines[1].start[1:])
     np.testing.assert_allclose(with_it[1].slope[1:], lines[1].slope, rtol=1e-9)
-    np.testing.assert_array_equal(with_it[3][1:], lines[3])

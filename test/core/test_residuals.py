@@ -9,12 +9,7 @@ from conftest import hilly_scan
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.core.frame import GroundSurface, Labelled, PolarGrid
 from gp_ground_seg.core.pipeline import residuals
-from gp_ground_seg.core.pipeline.residuals import (
-    HIDDEN,
-    LEAST_STD,
-    PRIOR_CELLS,
-    correct_surface,
-)
+from gp_ground_seg.core.pipeline.residuals import HIDDEN, LEAST_STD, PRIOR_CELLS, correct_surface
 from gp_ground_seg.lab.simulation import DRIVES, SENSORS, simulate_scan
 
 N_SEGMENTS = 7

@@ -21,13 +21,7 @@ from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab.experiments import SimulatedFrame, load_scan
 from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.scoring import metrics
-from gp_ground_seg.lab.scoring.evaluate import (
-    OURS,
-    PATCHWORKPP,
-    STAGE,
-    OurMethod,
-    sums,
-)
+from gp_ground_seg.lab.scoring.evaluate import OURS, PATCHWORKPP, STAGE, OurMethod, sums
 from gp_ground_seg.lab.scoring.metrics import COUNTS, label_ratios
 from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
 from gp_ground_seg.lab.scoring.tables import MEASURES

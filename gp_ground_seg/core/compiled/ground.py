@@ -21,14 +21,9 @@ from gp_ground_seg.core.gp.ground import (
     fits,
     noise_among,
     noise_in_doubt,
-    slope_before,
     variances_of,
 )
-from gp_ground_seg.core.gp.kernels import (
-    line_covariance,
-    line_variances,
-    paciorek,
-)
+from gp_ground_seg.core.gp.kernels import line_covariance, line_variances, paciorek
 from gp_ground_seg.core.gp.model import Model, SegmentSurfaces
 from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.parameters.config import ObservationConfig
@@ -47,7 +42,7 @@ class _Columns(NamedTuple):
     noise: FloatArray  # (n,) variances of the noise with which they are observed [m^2]
     neighbour_height: FloatArray  # (n,) evidence at the candidates [m]
     neighbour_precision: FloatArray  # (n,) its precision [1/m^2]
-    above: BoolArray  # (n,) candidates that the evidence contradicts
+    above: BoolArray  # (n,) candidates that the evidence contradicts, and that are not on land
     new: IntArray  # (n,) candidates that join in this round
     whitened: FloatArray  # (n, size) one row for each inlier
 
@@ -198,7 +193,8 @@ def _begin(
             height = between_knots(r, knots[j], knots[j + 1], heights[j], heights[j + 1])
             precision = between_knots(r, knots[j], knots[j + 1], precisions[j], precisions[j + 1])
         columns.neighbour_height[i], columns.neighbour_precision[i] = height, precision
-        columns.above[i] = contradicts(height, precision, z, noise)
+        above = contradicts(height, precision, z, noise)
+        columns.above[i] = above and not frame.land[c]
         found.inlier[c] = False
         if found.seed[c] and not columns.above[i]:
             columns.new[n_new] = i
@@ -273,14 +269,14 @@ def _find_joining(
         height, variance = _predict(i, columns)
         joins, falls, is_shown = fits(z, height, variance, noise, growth), False, False
         if last >= 0:
-            rise, r = z - columns.z[last], frame.candidates.r[first + last]
-            distance = frame.candidates.r[c] - r
+            rise = z - columns.z[last]
+            distance = frame.candidates.r[c] - frame.candidates.r[first + last]
             walkable = is_walkable(rise, distance, growth.max_slope)
             if walkable and not in_face and not columns.above[i]:
-                line = frame.lines.line[first + last]
-                extent = r - frame.candidates.r[frame.lines.start[line]]
-                before = slope_before(frame.lines.slope[line], extent, distance, growth)
-                is_shown, falls = carries_on(rise, distance, frame.onward[c], before), rise <= 0.0
+                line, r = frame.lines.line[c], frame.candidates.r
+                extent = r[frame.lines.start[line + 1] - 1] - r[c]
+                slope, falls = frame.lines.slope[line], rise <= 0.0
+                is_shown = carries_on(rise, distance, slope, extent, frame.land[c], growth)
             elif not joins:
                 last = -1  # it stands on the ground, which does not go on behind it
         if joins and model.by_roughness and not is_shown:

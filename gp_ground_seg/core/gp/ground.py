@@ -249,7 +249,8 @@ def grow_inliers(
     sill, gate_noise = variances_of(frame, theta, model.observation, ROUNDING_SINGLE)
     found.alike[:] = _count_near(candidates, np.exp(theta[3]) if model.by_roughness else 0.0)
     certain, beside = noise_among(found.alike, gate_noise), at_candidates(from_neighbours, frame)
-    above, noise, is_own = contradicts(*beside, z, gate_noise), certain.copy(), segment % step == 0
+    above = contradicts(*beside, z, gate_noise) & ~frame.land
+    noise, is_own = certain.copy(), segment % step == 0
     blocks = _prior_blocks(frame, found.log_length_scale, sill, model.observation, step)
     height, variance = np.zeros(len(z)), prior_variance(sill, model.observation, candidates.r)
     predicted, stops = combined(height, variance, *beside), frame.in_face | above
@@ -282,8 +283,8 @@ def _on_slope(
 ) -> tuple[BoolArray, BoolArray]:
     """Candidates to which the ground goes on from the last of those `chosen`, (C,).
 
-    Of the second ones the returns behind or before them show that it rises. Behind one that stands
-    on it, or is one of `stops`, it does not go on, until the next that is chosen.
+    Of the second ones others beside or behind show that it rises. Behind one that stands on it, or
+    is one of `stops`, it does not go on, until the next that is chosen.
     """
     (r, z, *_), offsets, lines = frame.candidates, frame.candidates.offsets, frame.lines
     place, first = np.arange(len(r)), np.repeat(offsets[:-1], np.diff(offsets))
@@ -294,33 +295,31 @@ def _on_slope(
         return np.concatenate([[-1], found])[:-1]
 
     before = last(chosen)
-    rise, distance, line = z - z[before], r - r[before], lines.line[before]
+    rise, distance = z - z[before], r - r[before]
     walkable = is_walkable(rise, distance, growth.max_slope) & ~stops
     is_open = (before >= first) & (last(~chosen & ~fitting & ~walkable) < before) & walkable
-    slope = slope_before(lines.slope[line], r[before] - r[lines.start[line]], distance, growth)
-    is_shown = is_open & carries_on(rise, distance, frame.onward, slope)
+    extent = r[lines.start[lines.line + 1] - 1] - r
+    slope, land = lines.slope[lines.line], frame.land
+    is_shown = is_open & carries_on(rise, distance, slope, extent, land, growth)
     return is_shown | (is_open & (rise <= 0.0)), is_shown
 
 
 @shared
-def carries_on(rise: Values, distance: Values, onward: Values, before: Values) -> Values:
+def carries_on(
+    rise: Values,
+    distance: Values,
+    slope: Values,
+    extent: Values,
+    land: Values,
+    growth: GrowthConfig,
+) -> Values:
     """Whether the ground is seen to go on as it rises by so much [m] over a distance [m].
 
-    `onward` is the slope behind: where it is less, the ground has come to an object. At the end of
-    a segment (NaN) it is `before`, see `slope_before`.
+    On land it is. Elsewhere the line of the candidate shows it, with its slope, if it goes on
+    behind for its `extent` [m]: where it rises less, the ground has come to an object.
     """
-    slope = choose(np.isnan(onward), before, onward)
-    return (rise > 0.0) & (RISES_ON * rise <= slope * distance)
-
-
-@shared
-def slope_before(slope: Values, extent: Values, distance: Values, growth: GrowthConfig) -> Values:
-    """Slope of a line as far as it tells that of the ground at a distance before it, or NaN.
-
-    That is not farther than the line reaches back, its `extent` [m].
-    """
-    is_long = (extent >= growth.min_rise_extent) & (extent >= distance)
-    return choose(is_long, slope, np.nan)
+    is_long = (extent >= growth.min_rise_extent) & (slope <= growth.max_slope)
+    return (rise > 0.0) & (land | (is_long & (RISES_ON * rise <= slope * distance)))
 
 
 def _prior_blocks(

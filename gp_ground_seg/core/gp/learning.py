@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, Inliers, Values
+from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, Inliers
 from gp_ground_seg.core.gp.evidence import Evidence
 from gp_ground_seg.core.gp.ground import grow_inliers
 from gp_ground_seg.core.gp.kernels import single_threaded_blas
@@ -204,7 +204,10 @@ def maximise(
     outcome[0], outcome[1] = -math.inf, CONVERGED
     if n_data == 0 or not any_free:
         return 0
-    search = search_from(theta, lower, upper)
+    d, start = len(theta), np.array([-math.inf, 1.0])
+    search = Search(
+        lower, upper, theta.copy(), np.zeros(d), theta.copy(), np.empty(d), np.eye(d), start
+    )
     n_evaluations, status = 0, BUDGET
     while n_evaluations < max_evaluations:
         for i in range(len(theta)):
@@ -215,8 +218,9 @@ def maximise(
                 slope[i] = 1.0  # it stays at its upper bound
                 continue
             if is_map:
-                value += log_prior(theta[i], space.centre[i], space.prior_std)
-                slope[i] += slope_of_prior(theta[i], space.centre[i], space.prior_std)
+                deviation = (theta[i] - space.centre[i]) / space.prior_std
+                value -= 0.5 * deviation * deviation
+                slope[i] -= deviation / space.prior_std
             slope[i] /= n_data
         n_evaluations += 1
         if n_evaluations == 1 and not math.isfinite(value):
@@ -229,19 +233,6 @@ def maximise(
         theta[i] = search.x[i]
     outcome[0], outcome[1] = search.value[0] * n_data, status
     return n_evaluations
-
-
-@shared
-def log_prior(value: Values, centre: Values, std: float) -> Values:
-    """Log density of an entry of theta, up to a constant."""
-    deviation = (value - centre) / std
-    return -0.5 * deviation * deviation
-
-
-@shared
-def slope_of_prior(value: Values, centre: Values, std: float) -> Values:
-    """Return the derivative of `log_prior` in `value`."""
-    return (centre - value) / (std * std)
 
 
 class Search(NamedTuple):
@@ -259,14 +250,6 @@ class Search(NamedTuple):
     turned: FloatArray  # (d,) working space
     inverse: FloatArray  # (d, d) of the negative curvature
     value: FloatArray  # (2,) at the best place; factor on the next step
-
-
-@shared
-def search_from(x: FloatArray, lower: FloatArray, upper: FloatArray) -> Search:
-    """Begin at `x`, within the bounds: the first trial."""
-    d, best, trial = len(x), x.copy(), x.copy()
-    value = np.array([-math.inf, 1.0])
-    return Search(lower, upper, best, np.zeros(d), trial, np.empty(d), np.eye(d), value)
 
 
 @shared

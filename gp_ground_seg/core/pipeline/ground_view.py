@@ -218,8 +218,10 @@ def objection_to_ground(scan: Scan, view: View | None) -> str:
 def _shows_lower_ends(view: View, scan: Scan) -> bool:
     """Whether a plane is one of lower ends: of things cut away below it, or of walls."""
     plane, c = view.plane, scan.candidates
+    can_be_cut = -plane.height - c.z.min() <= EDGE
     # A slope that is seen in few directions scatters as lower ends do.
-    if plane.normal[2] < math.cos(CUT_TILT) or plane.coverage < MIN_COVERAGE:
+    is_slope = plane.normal[2] < math.cos(CUT_TILT) or plane.coverage < MIN_COVERAGE
+    if is_slope or (view.is_surface and not can_be_cut):
         return False
     height = plane.below(c.x, c.y, c.z)
     is_on = np.abs(height) < np.where(c.r < CUT_REACH, tolerance_at(c.r), 0.0)
@@ -228,9 +230,8 @@ def _shows_lower_ends(view: View, scan: Scan) -> bool:
     if n_flat >= MOST_FLAT * np.count_nonzero(extent):
         return False
     low, high = np.quantile(height[is_on], (0.25, 0.75))
-    if high - low > FLOOR_SCATTER and not view.is_surface:
-        return True
-    return bool(-plane.height - c.z.min() <= EDGE and _is_cut(scan))
+    is_floor = view.is_surface or high - low <= FLOOR_SCATTER
+    return bool(not is_floor or (can_be_cut and _is_cut(scan)))
 
 
 def _is_cut(scan: Scan) -> bool:

@@ -14,7 +14,6 @@ from gp_ground_seg.core.frame import (
     Candidates,
     Faces,
     FloatArray,
-    IntArray,
     Lines,
     PseudoInputs,
     Values,
@@ -35,6 +34,9 @@ STEEPEST = 1e150
 """Slope over which all count as vertical; its square is finite."""
 POINT = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, math.nan
 """Line of one point, see `with_next`."""
+WIDE = 14.0
+"""Width over which the lowest returns of segments go on aside on land: rows of vehicles, and their
+sides, end before [m]."""
 N_CLASSES = 9
 """Classes of lines that share a length-scale."""
 
@@ -47,49 +49,51 @@ def find_lines(
     faces: Faces,
     config: Config,
     trace_lines: Callable[..., tuple[int, int]] | None = None,
-) -> tuple[Candidates, Lines, PseudoInputs, FloatArray, BoolArray]:
+) -> tuple[Candidates, Lines, PseudoInputs, BoolArray, BoolArray]:
     """Lines through the candidates that show ground, and what follows from the lines.
 
     The lowest point of a face with occluded base is no candidate. Returns the candidates kept,
-    lines, pseudo-inputs, how the ground goes on behind each, and which are in faces.
+    lines, pseudo-inputs, which are on land (see `find_land`), and which are in faces.
     `trace_lines` is `trace`, compiled.
     """
     candidates = candidates.where(~faces.has_occluded_base[candidates.tile])
     n = len(candidates.r)
     lines = Lines(np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64))
-    onward, (line, kind) = np.empty(n), np.zeros((2, n), np.int64)
+    land, (line, kind) = np.empty(n, np.bool_), np.zeros((2, n), np.int64)
     pseudo = PseudoInputs(np.empty(n), np.empty(n), candidates.offsets, line, kind)
     groups: Any = tuple(
         map(numbers_of, (config.lines, config.growth, config.latent, config.length_scale))
     )
+    in_face, is_start = faces.is_face[candidates.tile], find_starts(candidates, config.lines)
     n_lines, n = (trace_lines or _trace_at_once)(
-        candidates, find_starts(candidates, config.lines), groups, lines, pseudo, onward
+        candidates, is_start, in_face, groups, lines, pseudo, land
     )
     lines = Lines(lines.line, lines.slope[:n_lines], lines.start[: n_lines + 1])
     offsets = np.searchsorted(lines.start[line[:n]], candidates.offsets)
     pseudo = PseudoInputs(pseudo.r_bar[:n], pseudo.log_extent[:n], offsets, line[:n], kind[:n])
     if config.learning.length_scale == 'classes':
         pseudo = shared_by_class(lines, pseudo, config.length_scale)
-    return candidates, lines, pseudo, onward, faces.is_face[candidates.tile]
+    return candidates, lines, pseudo, land, in_face
 
 
 def _trace_at_once(
     candidates: Candidates,
     is_start: BoolArray,
+    in_face: BoolArray,
     groups: Groups,
     lines: Lines,
     pseudo: PseudoInputs,
-    onward: FloatArray,
+    land: BoolArray,
 ) -> tuple[int, int]:
     """Do what `trace` does, at once for all segments."""
     tolerances, growth, latent, limits = groups
-    r, z, offsets = candidates.r, candidates.z, candidates.offsets
+    r, z = candidates.r, candidates.z
     slope = _line_slopes(r, z, is_start, tolerances)
     start = np.flatnonzero(is_start)
     n_lines, size = len(slope), np.diff(start)
     lines.line[:] = np.repeat(np.arange(n_lines), size)
     lines.slope[:n_lines], lines.start[: n_lines + 1] = slope, start
-    onward[:] = _onward(r, z, offsets[1:][candidates.segment], growth)
+    land[:] = _is_land(candidates, in_face, growth)
     number = np.maximum(np.rint(size / latent.candidates_per_pseudo_input).astype(np.int64), 1)
     line = np.repeat(np.arange(n_lines), number)
     n, rank = len(line), np.arange(len(line)) - (np.cumsum(number) - number)[line]
@@ -127,19 +131,26 @@ def _line_slopes(
     return slope[is_start[:-1]]
 
 
-def _onward(r: FloatArray, z: FloatArray, stop: IntArray, growth: GrowthConfig) -> FloatArray:
-    """Do what `find_onward` does; `stop` (C,) is where the segment of each candidate ends."""
-    far, r_padded = np.minimum(np.arange(2, len(r) + 2), stop), np.append(r, np.inf)
-    while (is_near := (far < stop) & (r_padded[far] - r < growth.min_rise_extent)).any():
-        far += is_near
-    is_end = np.append(~is_walkable(np.diff(z), np.diff(r), growth.max_slope), True)
-    is_end[stop - 1] = True
-    # The last candidate that walkable steps lead to.
-    end = np.flatnonzero(is_end)[np.cumsum(is_end) - is_end]
-    onward = np.where((far == stop) & (end == stop - 1), np.nan, -np.inf)
-    c = np.flatnonzero(far <= end)
-    onward[c] = slope_behind(z[far[c]] - z[c], r[far[c]] - r[c], growth.max_slope)
-    return onward
+def _is_land(candidates: Candidates, in_face: BoolArray, growth: GrowthConfig) -> BoolArray:
+    """Do what `find_land` does."""
+    r, segment, n_segments = candidates.r, candidates.segment, candidates.n_segments
+    # Of one in a face the height is NaN, to which nothing goes on.
+    n, z = len(r), np.where(in_face, np.nan, candidates.z)
+    arc, number = 2.0 * math.pi / n_segments * r, np.zeros(n)
+    # Segments first, then ranges: what is nearest in the next segment is nearest of all.
+    share = 0.4 * r / r.max(initial=1.0)
+    middle = segment[1:] - 0.5 * np.diff(segment) + 0.5 * (share[1:] + share[:-1])
+    for side in (-1, 1):
+        beside = (segment + side) % n_segments
+        nearest = np.searchsorted(middle, beside + share)
+        goes_on = goes_aside(r[nearest] - r, z[nearest] - z, arc, growth.max_slope)
+        # Where steps lead to, or n, and how many. Each round doubles them.
+        at = np.append(np.where(goes_on & (segment[nearest] == beside), nearest, n), n)
+        steps = (at < n).astype(np.int64)
+        for _ in range(n_segments.bit_length()):
+            steps, at = steps + steps[at], at[at]
+        number += steps[:-1]
+    return np.minimum(number, n_segments) * arc >= WIDE
 
 
 def class_middles(limits: LengthScaleConfig) -> FloatArray:
@@ -187,10 +198,11 @@ def find_starts(candidates: Candidates, tolerances: LinesConfig) -> BoolArray:
 def trace(
     candidates: Candidates,
     is_start: BoolArray,
+    in_face: BoolArray,
     groups: Groups,
     lines: Lines,
     pseudo: PseudoInputs,
-    onward: FloatArray,
+    land: BoolArray,
 ) -> tuple[int, int]:
     """Fill the last three; return the number of lines, and that of pseudo-inputs.
 
@@ -199,7 +211,7 @@ def trace(
     """
     tolerances, growth, latent, limits = groups
     n_lines = extract_lines(candidates, is_start, tolerances, lines)
-    find_onward(candidates, growth, onward)
+    find_land(candidates, in_face, growth, land)
     return n_lines, select_pseudo_inputs(candidates, lines, n_lines, latent, limits, pseudo)
 
 
@@ -319,38 +331,46 @@ def place_of(rank: Values, number: Values, size: Values) -> Values:
 
 
 @shared
-def find_onward(candidates: Candidates, growth: GrowthConfig, onward: FloatArray) -> None:
-    """Slope with which the ground goes on behind each candidate, into `onward` (C,).
-
-    Over at least two more candidates and ``growth.min_rise_extent``, with no step between two;
-    -inf where it does not, NaN where the segment ends before that shows.
-    """
-    r, z, offsets = candidates.r, candidates.z, candidates.offsets
-    for m in range(len(offsets) - 1):
-        # The first that is far enough from c; the first that no walkable steps from c lead to.
-        far, step, stop = offsets[m], offsets[m], offsets[m + 1]
-        for c in range(offsets[m], stop):
-            onward[c] = -math.inf
-            far, step = max(far, c + 2), max(step, c + 1)
-            while far < stop and r[far] - r[c] < growth.min_rise_extent:
-                far += 1
-            while step < min(far + 1, stop) and is_walkable(
-                z[step] - z[step - 1], r[step] - r[step - 1], growth.max_slope
-            ):
-                step += 1
-            if step == stop <= far:
-                onward[c] = math.nan
-            elif far < step:
-                onward[c] = slope_behind(z[far] - z[c], r[far] - r[c], growth.max_slope)
-
-
-@shared
 def is_walkable(rise: Values, distance: Values, max_slope: Values) -> Values:
     """Whether ground rises or falls by so much over a distance [m]: no more than a slope."""
     return abs(rise) <= max_slope * (distance + UNEVEN)
 
 
 @shared
-def slope_behind(rise: Values, distance: Values, max_slope: Values) -> Values:
-    """Slope with which ground goes on that rises by so much over a distance [m]."""
-    return (rise + max_slope * UNEVEN) / distance
+def goes_aside(apart: Values, rise: Values, arc: Values, max_slope: float) -> Values:
+    """Whether ground goes on to a place that is farther by so much, and higher, beside an arc."""
+    return (abs(apart) <= arc) & is_walkable(rise, arc + abs(apart), max_slope)
+
+
+@shared
+def find_land(
+    candidates: Candidates, in_face: BoolArray, growth: GrowthConfig, land: BoolArray
+) -> None:
+    """Set in `land` (C,) where the ground goes on aside so far that it is no object.
+
+    It goes on to the nearest candidate of the segment beside if neither is in a face (`in_face`,
+    (C,)), their ranges differ by no more than the arc between them, and their heights as little as
+    those of ground. What stands on the ground ends within `WIDE`.
+    """
+    r, z, offsets = candidates.r, candidates.z, candidates.offsets
+    n_segments, number = len(offsets) - 1, np.zeros((2, len(r)))
+    angle, onto = 2.0 * math.pi / n_segments, np.empty(len(r), np.int64)
+    for side in range(2):
+        for m in range(n_segments):
+            beside = (m + 2 * side - 1) % n_segments
+            near, stop = offsets[beside], offsets[beside + 1]
+            for c in range(offsets[m], offsets[m + 1]):
+                while near + 1 < stop and abs(r[near + 1] - r[c]) < abs(r[near] - r[c]):
+                    near += 1
+                onto[c], is_any = -1, near < stop and not (in_face[c] or in_face[near])
+                if is_any and goes_aside(
+                    r[near] - r[c], z[near] - z[c], angle * r[c], growth.max_slope
+                ):
+                    onto[c] = near
+        # Twice around: the ring of segments has no end.
+        for k in range(2 * n_segments):
+            m = (k if side == 0 else -k) % n_segments
+            for c in range(offsets[m], offsets[m + 1]):
+                number[side, c] = number[side, onto[c]] + 1.0 if onto[c] >= 0 else 0.0
+    for c in range(len(r)):
+        land[c] = min(number[0, c] + number[1, c], n_segments) * angle * r[c] >= WIDE

@@ -14,14 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.frame import (
-    BoolArray,
-    Candidates,
-    Faces,
-    FloatArray,
-    PointArray,
-    Values,
-)
+from gp_ground_seg.core.frame import BoolArray, Candidates, Faces, FloatArray, PointArray, Values
 from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.terrain import REACH, SQUARE, reachable, with_standing
