@@ -293,7 +293,7 @@ def test_a_rough_path_between_hedges_is_no_cut_cloud(is_gutter):
 
 
 def test_a_hollow_around_few_beams_is_no_cut_cloud():
-    azimuth, angle = np.meshgrid(np.arange(0.0, 6.28, 0.01), np.radians(np.arange(-1.0, 16.0, 2.0)))
+    azimuth, angle = np.meshgrid(np.arange(0.0, 6.28, 0.01), np.radians(np.arange(-1, 16, 2)))
     r = 0.3 / (0.06 + np.tan(angle))  # beams on a cone, 0.3 m above its tip
     points = np.stack([r * np.cos(azimuth), r * np.sin(azimuth), -r * np.tan(angle)], axis=-1)
     assert LOWER_ENDS not in pose_of(points.reshape(-1, 3)).warnings
