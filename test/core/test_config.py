@@ -82,7 +82,6 @@ def test_a_box_is_six_numbers_or_none():
 
 WORD, CHOICE, SWITCH, CROP = 'frame.base', 'label.rule', 'surface.look_aside', 'input.crop_box'
 NO_WORDS = '', 'two words', 'ümlaut', 'a\n', '/base', 1, True, None
-SWAPPED = 0.5, -1.0, *BOX[2:]
 LIMITS = [
     ('grid.r_min', 'grid.r_max', 20.0, 30.0),
     ('length_scale.min', 'length_scale.max', 20.0, 60.0),
@@ -95,8 +94,9 @@ REFUSED = [
     *(({SWITCH: value}, ': must be true or false') for value in (1, 'true', None)),
     *(
         ({CROP: box}, r'^input\.crop_box = .*: must be none or six num')
-        for box in (BOX[:5], (*BOX, 1.0), SWAPPED, (*BOX[:5], math.nan), (*BOX[:5], 101.0),
-                    (*BOX[:5], True), (*BOX[:5], '1'), 'None', '[1', 1.0, None, True)
+        for box in (BOX[:5], (*BOX, 1.0), (0.5, -1.0, *BOX[2:]), (*BOX[:5], math.nan),
+                    (*BOX[:5], 101.0), (*BOX[:5], True), (*BOX[:5], '1'),
+                    'None', '[1', 1.0, None, True)
     ),
     ({'label.ground_tolerence': 1.0}, r'unknown parameter .*label\.ground_tolerance\?'),
     ({'ground_tolerance': 1.0}, r'unknown parameter .*label\.ground_tolerance\?'),

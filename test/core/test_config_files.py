@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from gp_ground_seg import Config
 from gp_ground_seg.core.parameters.config import PRESETS, parameter_specs
 
-GENERATE = 'run: make generate'
 generate = load_script('docs/generate.py')
 
 
@@ -41,7 +40,7 @@ def test_generated_files_are_up_to_date():
         'README.md', 'docs/parameters.md', *(f'config/{name}.yaml' for name in PRESETS)
     }  # fmt: skip
     for name, text in files.items():
-        assert (REPOSITORY / name).read_text(encoding='utf-8') == text, GENERATE
+        assert (REPOSITORY / name).read_text(encoding='utf-8') == text, 'run: make generate'
     assert {f'config/{path.name}' for path in (REPOSITORY / 'config').glob('*.yaml')} <= set(files)
 
 

@@ -30,8 +30,9 @@ MOUNTED['os1-64'] = dataclasses.replace(
     range_std=0.02,
     height=0.8,
 )
-DOWN = tuple(np.radians(np.linspace(45.0, -45.0, 64)).tolist())
-MOUNTED['os0-64'] = dataclasses.replace(MOUNTED['os1-64'], elevations=DOWN)
+MOUNTED['os0-64'] = dataclasses.replace(
+    MOUNTED['os1-64'], elevations=tuple(np.radians(np.linspace(45.0, -45.0, 64)).tolist())
+)
 MOUNTED['os0-64 low'] = dataclasses.replace(MOUNTED['os0-64'], height=0.4, min_range=0.1)
 MIDDLE = (np.arange(SECTORS) + 0.5) * (2.0 * np.pi / SECTORS) - np.pi
 

@@ -27,7 +27,6 @@ from gp_ground_seg.lab.scoring.peers import PatchworkppMethod
 from gp_ground_seg.lab.scoring.tables import MEASURES
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
-METHODS = OURS, PATCHWORKPP
 
 
 def evaluate(root, *methods, **options):
@@ -202,7 +201,9 @@ def test_tables_hold_the_sums_of_the_frames(tmp_path, capfd):
     ):
         own = frames if name == 'all' else frames[frames['sequence'] == name]
         ratios = label_ratios(own.groupby('method')[[*COUNTS]].sum())
-        ours, its = ({key: by[method] for key, by in ratios.items()} for method in METHODS)
+        ours, its = (
+            {key: by[method] for key, by in ratios.items()} for method in (OURS, PATCHWORKPP)
+        )
         compared = {'peer_iou': its['iou'], 'difference': ours['iou'] - its['iou']}
         assert row == {'sequence': name, 'n_scans': n_scans, **ours, **compared}
     *_, parameters, counted, theirs, last = output.splitlines()
