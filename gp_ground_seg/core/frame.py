@@ -221,6 +221,7 @@ class Frame(NamedTuple):
     candidates: Candidates
     lines: Lines
     pseudo: PseudoInputs
+    onward: FloatArray  # (C,) slope with which the ground goes on behind, -inf where it does not
     land: BoolArray  # (C,) whether the ground goes on aside so far that it is no object
     in_face: BoolArray  # (C,) whether the tile of a candidate has a vertical face
     knots: FloatArray  # (K,) ranges where the surface is wanted [m], read-only

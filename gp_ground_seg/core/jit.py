@@ -57,10 +57,7 @@ def choose(condition: Any, a: Any, b: Any) -> Any:
 
 
 def compiled_form(
-    plain: Callable[..., Any],
-    *,
-    fastmath: bool = False,
-    single: Callable[..., Any] | None = None,
+    plain: Callable[..., Any], *, fastmath: bool = False, single: Callable[..., Any] | None = None
 ) -> Callable[[_Function], _Function]:
     """Return a decorator for what runs in compiled code where it calls `plain`.
 

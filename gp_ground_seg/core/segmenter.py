@@ -178,9 +178,11 @@ class GroundSegmenter:
         # 4. Relief of the terrain; lines along each segment, over it, without lowest points of
         #    faces with occluded base; pseudo-inputs. The prior mean is the ground near the sensor.
         relief, candidates, shown = backend.find_relief(scan.candidates, faces, height, config)
-        candidates, lines, pseudo, land, in_face = backend.extract_lines(candidates, faces, config)
+        candidates, lines, pseudo, onward, land, in_face = backend.extract_lines(
+            candidates, faces, config
+        )
         knots, prior_mean = scan.grid.edges, -height
-        frame = Frame(candidates, lines, pseudo, land, in_face, knots, prior_mean)
+        frame = Frame(candidates, lines, pseudo, onward, land, in_face, knots, prior_mean)
         timer.mark('lines')
         # 5. Observation and latent process: hyper-parameters theta, inliers and surface.
         is_fixed = config.learning.mode == 'fixed'
@@ -247,11 +249,7 @@ class GroundSegmenter:
         return self._lock
 
     def _level(
-        self,
-        xyz: PointArray,
-        sensor: SensorConfig,
-        timer: StageTimer,
-        fallback: SensorPose | None,
+        self, xyz: PointArray, sensor: SensorConfig, timer: StageTimer, fallback: SensorPose | None
     ) -> tuple[Scan, SensorPose, MirrorImages, Config]:
         """Scan in the level frame, about the sensor, with mirror images raised.
 

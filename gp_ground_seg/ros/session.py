@@ -156,10 +156,7 @@ def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
             node = rclpy.create_node(
                 name, context=context, start_parameter_services=False, enable_rosout=False
             )
-        with (
-            stop_on_signals(heeded) as stop,
-            contextlib.closing(Session(node, stop)) as session,
-        ):
+        with stop_on_signals(heeded) as stop, contextlib.closing(Session(node, stop)) as session:
             yield session
             session.check()
     finally:

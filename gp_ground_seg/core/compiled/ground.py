@@ -23,7 +23,11 @@ from gp_ground_seg.core.gp.ground import (
     noise_in_doubt,
     variances_of,
 )
-from gp_ground_seg.core.gp.kernels import line_covariance, line_variances, paciorek
+from gp_ground_seg.core.gp.kernels import (
+    line_covariance,
+    line_variances,
+    paciorek,
+)
 from gp_ground_seg.core.gp.model import Model, SegmentSurfaces
 from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.parameters.config import ObservationConfig
@@ -42,7 +46,7 @@ class _Columns(NamedTuple):
     noise: FloatArray  # (n,) variances of the noise with which they are observed [m^2]
     neighbour_height: FloatArray  # (n,) evidence at the candidates [m]
     neighbour_precision: FloatArray  # (n,) its precision [1/m^2]
-    above: BoolArray  # (n,) candidates that the evidence contradicts, and that are not on land
+    above: BoolArray  # (n,) candidates that the evidence contradicts
     new: IntArray  # (n,) candidates that join in this round
     whitened: FloatArray  # (n, size) one row for each inlier
 
@@ -273,10 +277,8 @@ def _find_joining(
             distance = frame.candidates.r[c] - frame.candidates.r[first + last]
             walkable = is_walkable(rise, distance, growth.max_slope)
             if walkable and not in_face and not columns.above[i]:
-                line, r = frame.lines.line[c], frame.candidates.r
-                extent = r[frame.lines.start[line + 1] - 1] - r[c]
-                slope, falls = frame.lines.slope[line], rise <= 0.0
-                is_shown = carries_on(rise, distance, slope, extent, frame.land[c], growth)
+                is_shown = carries_on(rise, distance, frame.onward[c], frame.land[c])
+                falls = rise <= 0.0
             elif not joins:
                 last = -1  # it stands on the ground, which does not go on behind it
         if joins and model.by_roughness and not is_shown:

@@ -43,11 +43,7 @@ class _Walk(NamedTuple):
 
 @jit()
 def reachable(
-    candidates: Candidates,
-    faces: Faces,
-    height: float,
-    growth: GrowthConfig,
-    stands: BoolArray,
+    candidates: Candidates, faces: Faces, height: float, growth: GrowthConfig, stands: BoolArray
 ) -> BoolArray:
     """See the plain `reachable`, of which the second result is `stands`, to be set."""
     r, n = candidates.r, len(candidates.r)

@@ -47,10 +47,7 @@ from gp_ground_seg.core.pipeline.lines import is_walkable
 
 
 def estimate_surface(
-    frame: Frame,
-    theta: FloatArray,
-    config: Config,
-    fit: Callable[..., None] | None = None,
+    frame: Frame, theta: FloatArray, config: Config, fit: Callable[..., None] | None = None
 ) -> tuple[GroundSurface, FloatArray, FloatArray]:
     """Inliers that grow from low, near candidates, and the surface that rests on them.
 
@@ -283,10 +280,10 @@ def _on_slope(
 ) -> tuple[BoolArray, BoolArray]:
     """Candidates to which the ground goes on from the last of those `chosen`, (C,).
 
-    Of the second ones others beside or behind show that it rises. Behind one that stands on it, or
-    is one of `stops`, it does not go on, until the next that is chosen.
+    Of the second ones the returns behind or before them show that it rises. Behind one that stands
+    on it, or is one of `stops`, it does not go on, until the next that is chosen.
     """
-    (r, z, *_), offsets, lines = frame.candidates, frame.candidates.offsets, frame.lines
+    (r, z, *_), offsets = frame.candidates, frame.candidates.offsets
     place, first = np.arange(len(r)), np.repeat(offsets[:-1], np.diff(offsets))
 
     def last(marked: BoolArray) -> IntArray:
@@ -298,28 +295,18 @@ def _on_slope(
     rise, distance = z - z[before], r - r[before]
     walkable = is_walkable(rise, distance, growth.max_slope) & ~stops
     is_open = (before >= first) & (last(~chosen & ~fitting & ~walkable) < before) & walkable
-    extent = r[lines.start[lines.line + 1] - 1] - r
-    slope, land = lines.slope[lines.line], frame.land
-    is_shown = is_open & carries_on(rise, distance, slope, extent, land, growth)
+    is_shown = is_open & carries_on(rise, distance, frame.onward, frame.land)
     return is_shown | (is_open & (rise <= 0.0)), is_shown
 
 
 @shared
-def carries_on(
-    rise: Values,
-    distance: Values,
-    slope: Values,
-    extent: Values,
-    land: Values,
-    growth: GrowthConfig,
-) -> Values:
+def carries_on(rise: Values, distance: Values, onward: Values, land: Values) -> Values:
     """Whether the ground is seen to go on as it rises by so much [m] over a distance [m].
 
-    On land it is. Elsewhere the line of the candidate shows it, with its slope, if it goes on
-    behind for its `extent` [m]: where it rises less, the ground has come to an object.
+    On land it is. Elsewhere `onward`, the slope behind, shows it: where it is less, the ground has
+    come to an object.
     """
-    is_long = (extent >= growth.min_rise_extent) & (slope <= growth.max_slope)
-    return (rise > 0.0) & (land | (is_long & (RISES_ON * rise <= slope * distance)))
+    return (rise > 0.0) & (land | (RISES_ON * rise <= onward * distance))
 
 
 def _prior_blocks(

@@ -14,6 +14,7 @@ from gp_ground_seg.core.frame import (
     Candidates,
     Faces,
     FloatArray,
+    IntArray,
     Lines,
     PseudoInputs,
     Values,
@@ -34,9 +35,9 @@ STEEPEST = 1e150
 """Slope over which all count as vertical; its square is finite."""
 POINT = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, math.nan
 """Line of one point, see `with_next`."""
-WIDE = 11.0
-"""Width over which the lowest returns of segments go on aside on land [m]: with 8 m more objects
-are taken for it, with 14 m as few, and less of hills and terraces is found."""
+WIDE = 14.0
+"""Width over which the lowest returns of segments go on aside on land [m]. With 11 m more of hills
+is found, and more objects along real streets are taken for it."""
 N_CLASSES = 9
 """Classes of lines that share a length-scale."""
 
@@ -49,31 +50,31 @@ def find_lines(
     faces: Faces,
     config: Config,
     trace_lines: Callable[..., tuple[int, int]] | None = None,
-) -> tuple[Candidates, Lines, PseudoInputs, BoolArray, BoolArray]:
+) -> tuple[Candidates, Lines, PseudoInputs, FloatArray, BoolArray, BoolArray]:
     """Lines through the candidates that show ground, and what follows from the lines.
 
     The lowest point of a face with occluded base is no candidate. Returns the candidates kept,
-    lines, pseudo-inputs, which are on land (see `find_land`), and which are in faces.
-    `trace_lines` is `trace`, compiled.
+    lines, pseudo-inputs, how the ground goes on behind each, which are on land (`find_land`), and
+    which are in faces. `trace_lines` is `trace`, compiled.
     """
     candidates = candidates.where(~faces.has_occluded_base[candidates.tile])
     n = len(candidates.r)
     lines = Lines(np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64))
-    land, (line, kind) = np.empty(n, np.bool_), np.zeros((2, n), np.int64)
+    onward, land, (line, kind) = np.empty(n), np.empty(n, np.bool_), np.zeros((2, n), np.int64)
     pseudo = PseudoInputs(np.empty(n), np.empty(n), candidates.offsets, line, kind)
     groups: Any = tuple(
         map(numbers_of, (config.lines, config.growth, config.latent, config.length_scale))
     )
     in_face, is_start = faces.is_face[candidates.tile], find_starts(candidates, config.lines)
     n_lines, n = (trace_lines or _trace_at_once)(
-        candidates, is_start, in_face, groups, lines, pseudo, land
+        candidates, is_start, in_face, groups, lines, pseudo, onward, land
     )
     lines = Lines(lines.line, lines.slope[:n_lines], lines.start[: n_lines + 1])
     offsets = np.searchsorted(lines.start[line[:n]], candidates.offsets)
     pseudo = PseudoInputs(pseudo.r_bar[:n], pseudo.log_extent[:n], offsets, line[:n], kind[:n])
     if config.learning.length_scale == 'classes':
         pseudo = shared_by_class(lines, pseudo, config.length_scale)
-    return candidates, lines, pseudo, land, in_face
+    return candidates, lines, pseudo, onward, land, in_face
 
 
 def _trace_at_once(
@@ -83,6 +84,7 @@ def _trace_at_once(
     groups: Groups,
     lines: Lines,
     pseudo: PseudoInputs,
+    onward: FloatArray,
     land: BoolArray,
 ) -> tuple[int, int]:
     """Do what `trace` does, at once for all segments."""
@@ -93,6 +95,7 @@ def _trace_at_once(
     n_lines, size = len(slope), np.diff(start)
     lines.line[:] = np.repeat(np.arange(n_lines), size)
     lines.slope[:n_lines], lines.start[: n_lines + 1] = slope, start
+    onward[:] = _onward(r, z, candidates.offsets[1:][candidates.segment], growth)
     land[:] = _is_land(candidates, in_face, growth)
     number = np.maximum(np.rint(size / latent.candidates_per_pseudo_input).astype(np.int64), 1)
     line = np.repeat(np.arange(n_lines), number)
@@ -153,6 +156,21 @@ def _is_land(candidates: Candidates, in_face: BoolArray, growth: GrowthConfig) -
     return np.minimum(number, n_segments) * arc >= WIDE
 
 
+def _onward(r: FloatArray, z: FloatArray, stop: IntArray, growth: GrowthConfig) -> FloatArray:
+    """Do what `find_onward` does; `stop` (C,) is where the segment of each candidate ends."""
+    far, r_padded = np.minimum(np.arange(2, len(r) + 2), stop), np.append(r, np.inf)
+    while (is_near := (far < stop) & (r_padded[far] - r < growth.min_rise_extent)).any():
+        far += is_near
+    is_end = np.append(~is_walkable(np.diff(z), np.diff(r), growth.max_slope), True)
+    is_end[stop - 1] = True
+    # The last candidate that walkable steps lead to.
+    end = np.flatnonzero(is_end)[np.cumsum(is_end) - is_end]
+    onward = np.full(len(r), -np.inf)
+    c = np.flatnonzero(far <= end)
+    onward[c] = slope_behind(z[far[c]] - z[c], r[far[c]] - r[c], growth.max_slope)
+    return onward
+
+
 def class_middles(limits: LengthScaleConfig) -> FloatArray:
     """Log length in the middle of each class of lines, (N_CLASSES,) [log m].
 
@@ -202,6 +220,7 @@ def trace(
     groups: Groups,
     lines: Lines,
     pseudo: PseudoInputs,
+    onward: FloatArray,
     land: BoolArray,
 ) -> tuple[int, int]:
     """Fill the last three; return the number of lines, and that of pseudo-inputs.
@@ -211,6 +230,7 @@ def trace(
     """
     tolerances, growth, latent, limits = groups
     n_lines = extract_lines(candidates, is_start, tolerances, lines)
+    find_onward(candidates, growth, onward)
     find_land(candidates, in_face, growth, land)
     return n_lines, select_pseudo_inputs(candidates, lines, n_lines, latent, limits, pseudo)
 
@@ -331,9 +351,39 @@ def place_of(rank: Values, number: Values, size: Values) -> Values:
 
 
 @shared
+def find_onward(candidates: Candidates, growth: GrowthConfig, onward: FloatArray) -> None:
+    """Slope with which the ground goes on behind each candidate, into `onward` (C,).
+
+    Over at least two more candidates and ``growth.min_rise_extent``, with no step between two;
+    -inf where it does not, or the segment ends before that shows.
+    """
+    r, z, offsets = candidates.r, candidates.z, candidates.offsets
+    for m in range(len(offsets) - 1):
+        # The first that is far enough from c; the first that no walkable steps from c lead to.
+        far, step, stop = offsets[m], offsets[m], offsets[m + 1]
+        for c in range(offsets[m], stop):
+            onward[c] = -math.inf
+            far, step = max(far, c + 2), max(step, c + 1)
+            while far < stop and r[far] - r[c] < growth.min_rise_extent:
+                far += 1
+            while step < min(far + 1, stop) and is_walkable(
+                z[step] - z[step - 1], r[step] - r[step - 1], growth.max_slope
+            ):
+                step += 1
+            if far < step:
+                onward[c] = slope_behind(z[far] - z[c], r[far] - r[c], growth.max_slope)
+
+
+@shared
 def is_walkable(rise: Values, distance: Values, max_slope: Values) -> Values:
     """Whether ground rises or falls by so much over a distance [m]: no more than a slope."""
     return abs(rise) <= max_slope * (distance + UNEVEN)
+
+
+@shared
+def slope_behind(rise: Values, distance: Values, max_slope: Values) -> Values:
+    """Slope with which ground goes on that rises by so much over a distance [m]."""
+    return (rise + max_slope * UNEVEN) / distance
 
 
 @shared

@@ -66,11 +66,7 @@ class CorrectedSurface(NamedTuple):
 
 
 def correct_surface(
-    surface: GroundSurface,
-    labelled: Labelled,
-    grid: PolarGrid,
-    noise_std: float,
-    slope_std: float,
+    surface: GroundSurface, labelled: Labelled, grid: PolarGrid, noise_std: float, slope_std: float
 ) -> CorrectedSurface:
     """Correct a surface by the residuals of the returns called ground.
 
