@@ -299,12 +299,10 @@ class GroundSegmenter:
                 c = left.candidates
                 off = np.abs(view.plane.below(c.x, c.y, c.z))
                 near = left._replace(candidates=c.where(off < 2.0 * tolerance_at(c.r)))
-                view = self._look(near) or view
+                again = self._look(near) or view
                 # Walls close by have returns where any image would be, and show no plane.
-                if _is_mirror(view, scan):
-                    is_below = is_below_sensor(view.plane, scan)
-                    plane = view.plane._replace(is_below_sensor=is_below)
-                    return view._replace(plane=plane, is_mirror=True)
+                if _is_mirror(again, scan):
+                    return again._replace(is_mirror=True)
         return below
 
     def _about_axes(self, xyz: PointArray, below: View | None) -> View | None:

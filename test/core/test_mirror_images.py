@@ -22,7 +22,7 @@ from gp_ground_seg.lab.simulation import SENSORS, Scene
 from gp_ground_seg.lab.simulation.objects import floating_box
 from gp_ground_seg.lab.simulation.scenes import WetPatch
 
-WET = [('hdl-64e', 0), (dataclasses.replace(SENSORS['vlp-16'], roll=0.03, pitch=-0.03), 1)]
+WET = [('hdl-64e', 0), ('vlp-16', 1)]
 DRY = ['ramp', 'rough', 'ditch', 'dike', 'hills', 'urban', 'car_park', 'low_boxes']
 
 

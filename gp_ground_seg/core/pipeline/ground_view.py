@@ -162,15 +162,10 @@ def is_below_sensor(plane: GroundPlane, scan: Scan) -> bool:
     """Whether a plane is seen as from a sensor at the origin: steeply, or by a cone of rays."""
     if plane.height < LOW or not LEAST_DEPRESSION <= plane.depression < STEEP_DEPRESSION:
         return plane.depression >= LEAST_DEPRESSION
-    c = scan.candidates
-    # The cone is about z, or about the normal in a cloud that was turned.
-    for z in (c.z, plane.below(c.x, c.y, c.z) - plane.height):
-        steepest = np.full(N_SECTORS, -np.inf)
-        np.maximum.at(steepest, c.segment * N_SECTORS // c.n_segments, np.arctan2(-z, c.r))
-        low, high = np.quantile(steepest[np.isfinite(steepest)], (0.25, 0.75))
-        if high - low < ONE_ANGLE * high:
-            return True
-    return False
+    c, steepest = scan.candidates, np.full(N_SECTORS, -np.inf)
+    np.maximum.at(steepest, c.segment * N_SECTORS // c.n_segments, np.arctan2(-c.z, c.r))
+    low, high = np.quantile(steepest[np.isfinite(steepest)], (0.25, 0.75))
+    return bool(high - low < ONE_ANGLE * high)
 
 
 def is_doubtful(below: View | None) -> bool:

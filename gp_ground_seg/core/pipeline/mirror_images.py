@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray, PointArray, Scan
-from gp_ground_seg.core.pipeline.ground_plane import GroundPlane, crossing_of
+from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.ground_view import View
 from gp_ground_seg.core.pipeline.lowest_points import tolerance_at
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
@@ -37,10 +37,9 @@ WET_SHARE, WET_REACH = 0.1, 20.0
 asked for what they are images of."""
 COUNTERPART = 0.2
 """Side of the boxes in which a counterpart is looked for: its own and those around it [m]."""
-MIRRORED = 0.28
-"""Share of what is deep below a plane that has a counterpart over it, and a ray through what is
-seen of the plane, from which it is a mirror: 0.27 to 0.77 in simulated wet scans, up to 0.18 in
-crowded rooms and over tables. Dry scans outdoors have none: the tiles tell them."""
+MIRRORED = 0.4
+"""Share of what is deep below a plane that has a counterpart over it, from which the plane is a
+mirror. Simulated wet scans have 0.45 to 0.88, dry real ones outdoors none: the tiles tell them."""
 
 
 class MirrorImages(NamedTuple):
@@ -74,32 +73,34 @@ def find_mirror_images(scan: Scan, pose: SensorPose, view: View | None) -> Mirro
     above the line of sight to ground that is seen nearer. Where rays start must be known, or
     nothing is told. `view` is the plane that the pose was estimated from, if there is one.
     """
-    grid = scan.grid
-    if not pose.starts_rays or pose.sensor_height <= 0.0 or (view is not None and view.is_dry):
+    grid, plane_z = scan.grid, -pose.sensor_height
+    if not pose.starts_rays or plane_z >= 0.0 or (view is not None and view.is_dry):
         return NO_IMAGES
-    plane = pose.plane
     is_mirror = view is not None and view.is_mirror and pose.height_estimated
-    if not is_mirror and mirror_share(plane, scan) < MIRRORED:
+    if not is_mirror and mirror_share(GroundPlane(pose.sensor_height), scan) < MIRRORED:
         return NO_IMAGES
     inside = np.flatnonzero(grid.inside)
-    x, y, z = scan.xyz[inside].T.astype(np.float64)
-    r, z = grid.r[inside].astype(np.float64), plane.below(x, y, z)
-    slope, cell = slope_of_sight(r, z - plane.height), grid.cell[inside].astype(np.int64)
-    is_ground = (r >= NEAREST) & (r < GROUND_REACH) & (np.abs(z) <= tolerance_at(r))
+    r, z = grid.r[inside].astype(np.float64), scan.xyz[inside, 2].astype(np.float64)
+    slope, cell = slope_of_sight(r, z), grid.cell[inside].astype(np.int64)
+    is_ground = (r >= NEAREST) & (r < GROUND_REACH) & (np.abs(z - plane_z) <= tolerance_at(r))
     shape = grid.n_segments, grid.n_bins
     nearer = _nearer_about(slope[is_ground], cell[is_ground], shape, N_ASIDE)[cell]
     # Only a line of sight that points down meets the plane: at its height over its slope.
-    can_be = (nearer < 0.0) & ((nearer - slope) * plane.height > OVER_SIGHT * nearer)
-    can_be &= (r >= NEAREST) & (r < IMAGE_REACH) & (z < DEEP)
+    can_be = (nearer < 0.0) & ((slope - nearer) * plane_z > OVER_SIGHT * nearer)
+    can_be &= (r >= NEAREST) & (r < IMAGE_REACH) & (z < plane_z + DEEP)
     low = np.flatnonzero(can_be)
     bare = np.flatnonzero(is_ground & (slope >= nearer))
     extremes = scan.tiles.extremes[scan.tiles.tile[inside[bare]]]
     bare = bare[extremes[:, 1] - extremes[:, 0] < 2.0 * DEEP]  # where nothing stands
-    before = _ground_before(z[bare], cell[bare], shape)[cell[low]]
-    is_seen = np.isfinite(before)
-    mirror_z = np.where(is_seen, before, 0.0)
-    is_deep = z[low] < mirror_z - np.where(is_seen, BELOW, DEEP)
-    return MirrorImages(inside[low[is_deep]], 2.0 * (mirror_z - z[low])[is_deep])
+    is_image = np.zeros(len(z), dtype=np.bool_)
+    for _ in range(2):  # the second time without images that count as ground the first time
+        tells = bare[~is_image[bare]]
+        before = _ground_before(z[tells], cell[tells], shape)[cell[low]]
+        is_seen = np.isfinite(before)
+        mirror_z = np.where(is_seen, before, plane_z)
+        is_image[low] = is_deep = z[low] < mirror_z - np.where(is_seen, BELOW, DEEP)
+    rise = 2.0 * (mirror_z - z[low])
+    return MirrorImages(inside[low[is_deep]], rise[is_deep])
 
 
 @np.errstate(invalid='ignore', over='ignore')
@@ -107,8 +108,7 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     """Share of what is deep below a plane that is the image of another return; 0 if little is.
 
     A wet road mirrors what stands on it: raised over the road again, its image meets other returns
-    of it, and the ray to it crosses the road where it is seen. What is seen of a valley meets
-    none; rays to the floor between tables, or of a crowded room, cross a plane beside its returns.
+    of it. What is seen of a valley, or below a table or a dock, meets none.
     """
     candidates = scan.candidates
     over = plane.below(candidates.x, candidates.y, candidates.z)
@@ -136,14 +136,7 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     has_return[index[inside]] = True
     around = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 3) @ strides
     boxes = ((raised - low) / COUNTERPART).astype(np.int64) @ strides
-    is_image = has_return[np.add.outer(boxes, around)].any(axis=1)
-    # Bins in which the plane is seen, or the one before or behind, with none beyond either end.
-    is_seen = np.zeros((candidates.n_segments, scan.grid.n_bins + 2), dtype=np.bool_)
-    for step in (0, 1, 2):
-        is_seen[candidates.segment[is_on_it], candidates.bin[is_on_it] + step] = True
-    crossing = crossing_of(candidates.r[deep], over[deep], plane[:3])
-    crossed = np.searchsorted(scan.grid.edges[1:], crossing, side='right') + 1
-    return float((is_image & is_seen[candidates.segment[deep], crossed]).mean())
+    return float(has_return[np.add.outer(boxes, around)].any(axis=1).mean())
 
 
 def in_sight(candidates: Candidates) -> Candidates:

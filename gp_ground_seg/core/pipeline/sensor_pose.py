@@ -89,13 +89,6 @@ class SensorPose:
         return self.height + float(self.rotation[2] @ self.origin)
 
     @property
-    def plane(self) -> GroundPlane:
-        """Plane of the ground in the level frame, about the sensor: tilted if it was left so."""
-        seen = self.measured
-        x, y, z = self.rotation @ rotation(seen.roll, seen.pitch)[2] if seen else (0.0, 0.0, 1.0)
-        return GroundPlane(self.sensor_height, -x / z, -y / z)
-
-    @property
     def starts_rays(self) -> bool:
         """Whether the ground is seen as from a sensor at the origin that was taken."""
         return self.measured is not None and self.measured.plane.is_below_sensor
