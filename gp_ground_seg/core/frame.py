@@ -222,7 +222,7 @@ class Frame(NamedTuple):
     lines: Lines
     pseudo: PseudoInputs
     onward: FloatArray  # (C,) slope with which the ground goes on behind, -inf where it does not
-    land: BoolArray  # (C,) whether the ground goes on aside so far that it is no object
+    land: BoolArray  # (C,) whether what lies on both sides is as high, too wide for an object
     in_face: BoolArray  # (C,) whether the tile of a candidate has a vertical face
     knots: FloatArray  # (K,) ranges where the surface is wanted [m], read-only
     prior_mean: float  # prior mean of the ground's height [m]

@@ -125,7 +125,18 @@ def highest_ground(frame: Frame, z: FloatArray, seed: BoolArray, max_slope: floa
     """Largest height of ground that rises by `max_slope` from the seeds, (C,) [m].
 
     Distances are taken along ranges and arcs, between the near edges of bins: outwards and
-    inwards, around, and outwards and inwards again. `z` (C,) are heights [m].
+    inwards, around, and outwards and inwards again.
+
+    Parameters
+    ----------
+    frame : Frame
+        Candidates and knots.
+    z : (C,) float64
+        Heights of the candidates [m].
+    seed : (C,) bool
+        Candidates that the ground rises from.
+    max_slope : float
+        Rise per metre.
     """
     candidates, segment = frame.candidates, frame.candidates.segment
     if not seed.any():
