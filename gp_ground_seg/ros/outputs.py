@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -184,11 +183,7 @@ class OutputPublishers:
     _stamp = math.inf  # of the last cloud [s]
 
     def __init__(self, node: Node) -> None:
-        options = {
-            'qos_overriding_options': QoSOverridingOptions.with_default_policies(),
-            # The executor would wait for the events of each anew. A subscriber is told, too.
-            'event_callbacks': PublisherEventCallbacks(use_default_callbacks=False),
-        }
+        options = {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
         self._publishers = [
             # A copy: rclpy writes qos_overrides of this node into it.
             (o, node.create_publisher(o.message_type, o.topic, copy(o.profile), **options))

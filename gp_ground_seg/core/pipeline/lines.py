@@ -36,8 +36,8 @@ STEEPEST = 1e150
 POINT = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, math.nan
 """Line of one point, see `with_next`."""
 WIDE = 14.0
-"""Width over which the lowest returns of segments go on aside on land [m]. With 11 m more of hills
-is found, and more objects along real streets are taken for it."""
+"""Width over which candidates of neighbouring segments form one surface on land [m]. With 11 m
+more of hills is found, and more objects along real streets are taken for it."""
 N_CLASSES = 9
 """Classes of lines that share a length-scale."""
 
@@ -388,7 +388,7 @@ def slope_behind(rise: Values, distance: Values, max_slope: Values) -> Values:
 
 @shared
 def goes_aside(apart: Values, rise: Values, arc: Values, max_slope: float) -> Values:
-    """Whether ground goes on to a place that is farther by so much, and higher, beside an arc."""
+    """Whether ground can reach a candidate one segment on, which is so much farther and higher."""
     return (abs(apart) <= arc) & is_walkable(rise, arc + abs(apart), max_slope)
 
 
@@ -396,11 +396,11 @@ def goes_aside(apart: Values, rise: Values, arc: Values, max_slope: float) -> Va
 def find_land(
     candidates: Candidates, in_face: BoolArray, growth: GrowthConfig, land: BoolArray
 ) -> None:
-    """Set in `land` (C,) where the ground goes on aside so far that it is no object.
+    """Set in `land` (C,) whether a candidate is of a surface too wide for an object: `WIDE` [m].
 
-    It goes on to the nearest candidate of the segment beside if neither is in a face (`in_face`,
-    (C,)), their ranges differ by no more than the arc between them, and their heights as little as
-    those of ground. What stands on the ground ends within `WIDE`.
+    The surface continues in the nearest candidate of a neighbouring segment if neither is in a
+    face (`in_face`, (C,)), their ranges differ by no more than the arc between them, and their
+    heights by no more than those of ground.
     """
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     n_segments, number = len(offsets) - 1, np.zeros((2, len(r)))
