@@ -156,6 +156,15 @@ def test_what_stands_on_the_ground_has_ground_before_and_behind_it(backend, name
     assert not NO_FACES.is_face.any()
 
 
+def test_land_behind_a_gap_between_rings_does_not_stand(backend):
+    """A pitched sensor with 16 beams: no step of the allowed length leads to its far rings."""
+    rings = np.array([3.0, 3.6, 4.2, 5.0, 6.2, 7.0, 11.0, 18.0, 30.0])
+    road = box(7.2, 24.0, -6.0, 6.0, 0.045)
+    candidates = candidates_on(lambda x, y: x * road(x, y), rings)
+    faces = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())[2]
+    assert not faces.is_face.any()
+
+
 def test_no_way_leads_over_returns_that_are_too_steep(backend):
     candidates = candidates_on(STANDING['plateau'][0], np.arange(3.0, 20.0, 0.4))
     over = candidates.z + HEIGHT

@@ -109,11 +109,13 @@ def _leave_out_not_entered(
     candidates: Candidates, walk: _Walk, is_terrain: BoolArray, stands: BoolArray
 ) -> None:
     """See the plain `_entered`. A part of raised terrain is reached as a whole, or not at all."""
-    offsets, is_before = candidates.offsets, np.zeros(len(is_terrain), np.bool_)
+    r, offsets, is_before = candidates.r, candidates.offsets, np.zeros(len(is_terrain), np.bool_)
     for m in range(len(offsets) - 1):
         sees_lower = False
         for c in range(offsets[m + 1] - 1, offsets[m] - 1, -1):
-            is_before[c] = sees_lower and walk.is_raised[c]
+            is_near = c > offsets[m] and r[c] - r[c - 1] <= largest_gap(r[c])
+            is_foot = is_near and _root(walk.part, c) != _root(walk.part, c - 1)
+            is_before[c] = sees_lower and walk.is_raised[c] and is_foot
             sees_lower |= is_terrain[c] and not walk.is_raised[c]
     entry = _widths(candidates, walk.part, walk.is_entry)
     before = _widths(candidates, walk.part, is_before)

@@ -128,8 +128,13 @@ def _entered(
     entry = width_of(upper[taken & (is_raised[first] != is_raised[second])])
     low, last = np.flatnonzero(allowed & ~is_raised), np.full(n_segments, -1)
     last[candidates.segment[low]] = low
-    is_before_low = is_raised & (np.arange(len(allowed)) < last[candidates.segment])
-    stands = is_raised & has_few_entries(entry, width_of(np.flatnonzero(is_before_low)))
+    before = np.flatnonzero(is_raised & (np.arange(len(allowed)) < last[candidates.segment]))
+    # Where nothing is seen just before them, no step can lead there.
+    before = before[before > 0]
+    is_near = candidates.r[before] - candidates.r[before - 1] <= largest_gap(candidates.r[before])
+    is_near &= candidates.segment[before] == candidates.segment[before - 1]
+    feet = before[is_near & (part[before] != part[before - 1])]
+    stands = is_raised & has_few_entries(entry, width_of(feet))
     return allowed & (~is_raised | (entry >= MIN_ENTRY)), stands
 
 
