@@ -22,7 +22,7 @@ from gp_ground_seg.core.pipeline.sensor_pose import MeasuredPose
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data import bags, files, inputs, semantic_kitti
-from gp_ground_seg.data.cloud_files import FORMATS, LABELS, encode_output, format_for
+from gp_ground_seg.data.cloud_files import FORMATS, LABELS, encode_output
 from gp_ground_seg.data.inputs import Input, Inputs
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points
 from gp_ground_seg.lab.cluster import Progress
@@ -219,8 +219,9 @@ class Outcome(NamedTuple):
 
 
 def output_of(folder: Path, form: str | None, scan: Input) -> Path:
-    """File of a folder that a scan becomes, of a format or by default of its own."""
-    return folder / f'{scan.name}.{format_for(scan.path, form)}'
+    """File of a folder that a scan becomes, of a format or its own; of a `.bin` `LABELS`."""
+    suffix = scan.path.suffix.lower()[1:]
+    return folder / f'{scan.name}.{form or (suffix if suffix in FORMATS else LABELS)}'
 
 
 def segment_scans(

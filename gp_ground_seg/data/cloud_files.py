@@ -18,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError, PointCloudError
-from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.pipeline.points import finite_points, hint_of_table, objection_to_ranges
 from gp_ground_seg.data import clouds
 from gp_ground_seg.data.clouds import Cloud, Columns, Fields
@@ -128,8 +127,7 @@ SUFFIXES = ('.bin', *_READERS)
 WRITABLE = tuple(_ENCODERS)
 LABELS = 'label'
 FORMATS = (LABELS, *(suffix[1:] for suffix in WRITABLE))
-# Unlabelled, road and other-object.
-SEMANTIC_KITTI_CODE = {Label.UNKNOWN: 0, Label.GROUND: 40, Label.OBSTACLE: 99}
+SEMANTIC_KITTI_CODE = np.array([0, 40, 99], '<u4')  # by `Label`: unlabelled, road, other-object
 _VALUES = ('height', 'ground_z', 'ground_std', 'p_ground')
 
 
@@ -168,12 +166,6 @@ def encode_file(path: Path, cloud: Cloud, columns: Columns) -> bytes:
         return _ENCODERS[path.suffix](cloud.join(columns))
 
 
-def format_for(path: Path, wanted: str | None) -> str:
-    """One of `FORMATS` for the output of a scan: by default its own, and labels of ``.bin``."""
-    suffix = path.suffix.lower()[1:]
-    return wanted or (suffix if suffix in FORMATS else LABELS)
-
-
 def encode_output(path: Path, cloud: Cloud, result: Segmentation) -> bytes:
     """File of a cloud with its labels, of the format of `path`; DataError if none can be.
 
@@ -181,8 +173,7 @@ def encode_output(path: Path, cloud: Cloud, result: Segmentation) -> bytes:
     the cloud, label and values of each point.
     """
     if path.suffix[1:] == LABELS:
-        codes = [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
-        return np.array(codes, dtype='<u4')[result.label].tobytes()
+        return SEMANTIC_KITTI_CODE[result.label].tobytes()
     values = {name: getattr(result, name).astype(np.float32) for name in _VALUES}
     return encode_file(path, cloud, {'label': result.label, **values})
 

@@ -226,8 +226,7 @@ def _faults_of(scan: Segmentation) -> list[str]:
         return faults
     if not scan.fit.n_segments:
         return ['no ground found in the newest cloud']
-    is_failed = scan.fit.status == 'failed'
-    return ['the hyper-parameters could not be learned'] if is_failed else []
+    return ['the hyper-parameters could not be learned'] if scan.fit.status == 'failed' else []
 
 
 def kept_height(pose: SensorPose) -> str:
@@ -307,15 +306,16 @@ class Diagnostics:
             throttle_duration_sec=LOG_PERIOD,
             throttle_time_source_type=STEADY_CLOCK,
         )
-        for status in statuses:
-            message = DiagnosticStatus(
+        array.status = [
+            DiagnosticStatus(
                 level=bytes([status.level]),
                 name=f'{node_name.lstrip("/")}: {status.task}',
                 message=status.message,
                 hardware_id=node_name,
                 values=[KeyValue(key=k, value=v) for k, v in status.values.items()],
             )
-            array.status.append(message)
+            for status in statuses
+        ]
         self._publisher.publish(array)
 
 

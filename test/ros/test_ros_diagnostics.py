@@ -146,17 +146,12 @@ def test_drops_are_a_warning_once_and_counted_for_ever():
     assert [report.values['Dropped since startup'] for report in reports] == ['0', '3', '3']
 
 
-def status_of(points, **changes):
-    """Segmentation, and what is reported of it."""
-    segmentation = GroundSegmenter(Config().replace(**changes)).segment(points)
-    return segmentation, model_status(segmentation)
-
-
 def test_model_reports_the_newest_scan():
     assert model_status(None).level == Level.OK
     xyz = hilly_scan()
     xyz[:300, 2], xyz[300:400] = np.nan, 0.0
-    segmentation, status = status_of(xyz, **{'grid.n_segments': 24})
+    segmentation = GroundSegmenter(Config().replace(**{'grid.n_segments': 24})).segment(xyz)
+    status = model_status(segmentation)
     fit, pose, ground = segmentation.fit, segmentation.pose, segmentation.label == 1
     assert [*status.values.items()] == [
         ('Segments with a model', f'{fit.n_segments} of 24'),
@@ -187,21 +182,18 @@ def test_a_tilt_that_the_scan_contradicts_has_the_name_of_what_gave_it():
         assert model_status(scan, level).message.startswith(said)
 
 
-NOTHING = 'no ground found in the newest cloud'
-
-
 @pytest.mark.parametrize(
     ('points', 'changes', 'fault', 'height'),
     [
         (hilly_scan(20_000), {'sensor.height': 1.73}, '', '1.7'),
         # Given wrongly: a warning that says so, not a repair.
         (hilly_scan(20_000), {'sensor.height': 3.5}, 'sensor.height', '1.7'),
-        (np.zeros((0, 3)), {}, NOTHING, 'unknown'),
-        (np.full((9, 3), np.nan), {}, NOTHING, 'unknown'),
+        (np.zeros((0, 3)), {}, 'no ground found in the newest cloud', 'unknown'),
+        (np.full((9, 3), np.nan), {}, 'no ground found in the newest cloud', 'unknown'),
     ],
 )
 def test_a_wrong_height_and_no_ground_are_warnings(points, changes, fault, height):
-    _, status = status_of(points, **changes)
+    status = model_status(GroundSegmenter(Config().replace(**changes)).segment(points))
     assert status.level == (Level.WARN if fault else Level.OK)
     assert fault in status.message
     assert status.values['Estimated height (m)'].startswith(height)

@@ -261,16 +261,17 @@ def _hedge(rng: np.random.Generator) -> Parts:
 
 def _around(
     smooth: Terrain,
-    terrain: Terrain,
+    waves: Terrain,
     rng: np.random.Generator,
     reach: tuple[float, float],
     places: Sequence[tuple[float, float]] = (),
-) -> Iterator[Solid]:
-    """Cars, persons, crates, poles and walls on `terrain`, in a `reach` [m] from the origin.
+) -> Parts:
+    """Terrain with small `waves`, and cars, persons, crates, poles and walls in a `reach` [m].
 
-    Cars are where `smooth`, the terrain without its small waves, is even, and lean with it. There
-    are a person and a crate in turns at `places` (x, y) [m] as well.
+    Cars are where `smooth`, the terrain without the waves, is even, and lean with it. There are a
+    person and a crate in turns at `places` (x, y) [m] as well.
     """
+    yield (terrain := Sum((smooth, waves)))
     for k, place in enumerate(places):
         crate = objects.crate(terrain, *place, rng.uniform(*CRATES))
         yield from crate if k % 2 else traffic.person(terrain, *place)
@@ -301,8 +302,7 @@ def _around(
 def _hills(rng: np.random.Generator) -> Parts:
     """Waves of 14 to 45 m, 0.9 m rms, and of 1 to 5 m, 4 cm rms, on which the vehicle leans."""
     smooth = rough(rng, 0.9, (14.0, 45.0))
-    yield (terrain := Sum((smooth, rough(rng, 0.04, (1.0, 5.0)))))
-    yield from _around(smooth, terrain, rng, (6.0, 32.0))
+    yield from _around(smooth, rough(rng, 0.04, (1.0, 5.0)), rng, (6.0, 32.0))
 
 
 def _valley(rng: np.random.Generator) -> Parts:
@@ -312,10 +312,10 @@ def _valley(rng: np.random.Generator) -> Parts:
     corners = [(-top, 6.0), (-floor, 0.0), (floor, 0.0), (top, 6.0)]
     heading = rng.uniform(-math.pi, math.pi)
     smooth = polyline(heading, corners)
-    yield (terrain := Sum((smooth, rough(rng, 0.03, (1.0, 6.0)))))
-    along = _Line(terrain, rng, heading - 0.5 * math.pi, 0.0)
+    waves = rough(rng, 0.03, (1.0, 6.0))
+    along = _Line(smooth, rng, heading - 0.5 * math.pi, 0.0)
     places = [along.at(k, rng.uniform(-0.6, 0.6) * floor) for k in ENDS]
-    yield from _around(smooth, terrain, rng, (6.0, 24.0), places)
+    yield from _around(smooth, waves, rng, (6.0, 24.0), places)
 
 
 def _bank(slope: float, rng: np.random.Generator) -> Parts:
@@ -324,10 +324,10 @@ def _bank(slope: float, rng: np.random.Generator) -> Parts:
     foot, rise = rng.uniform(9.0, 14.0), rng.uniform(2.5, 4.5)
     depth = rise / gradient
     smooth = polyline(heading, [(foot, 0.0), (foot + depth, rise)])
-    yield (terrain := Sum((smooth, rough(rng, 0.02, (1.0, 8.0)))))
-    middle = _Line(terrain, rng, heading - 0.5 * math.pi, foot + 0.5 * depth)
+    waves = rough(rng, 0.02, (1.0, 8.0))
+    middle = _Line(smooth, rng, heading - 0.5 * math.pi, foot + 0.5 * depth)
     places = [middle.at(k, rng.uniform(-0.25, 0.25) * depth) for k in (-10.0, -3.5, 3.5, 10.0)]
-    yield from _around(smooth, terrain, rng, (6.0, 32.0), places)
+    yield from _around(smooth, waves, rng, (6.0, 32.0), places)
 
 
 def _on_ramp(rng: np.random.Generator) -> Parts:
@@ -335,8 +335,7 @@ def _on_ramp(rng: np.random.Generator) -> Parts:
     gradient, behind, ahead = rng.uniform((0.15, 4.0, 5.0), (0.25, 8.0, 9.0)).tolist()
     corners = [(-behind, -gradient * behind), (ahead, gradient * ahead)]
     smooth = polyline(rng.uniform(-math.pi, math.pi), corners)
-    yield (terrain := Sum((smooth, rough(rng, 0.01, (1.0, 8.0)))))
-    yield from _around(smooth, terrain, rng, (6.0, 28.0))
+    yield from _around(smooth, rough(rng, 0.01, (1.0, 8.0)), rng, (6.0, 28.0))
 
 
 def _dike(rng: np.random.Generator) -> Parts:
@@ -345,10 +344,10 @@ def _dike(rng: np.random.Generator) -> Parts:
     half, high = rng.uniform(2.5, 4.0), rng.uniform(1.0, 2.0)
     foot = half + high / gradient
     smooth = polyline(heading, [(-foot, -high), (-half, 0.0), (half, 0.0), (foot, -high)])
-    yield (terrain := Sum((smooth, rough(rng, 0.02, (1.0, 8.0)))))
-    along = _Line(terrain, rng, heading - 0.5 * math.pi, 0.0)
+    waves = rough(rng, 0.02, (1.0, 8.0))
+    along = _Line(smooth, rng, heading - 0.5 * math.pi, 0.0)
     places = [along.at(k, rng.uniform(-0.6, 0.6) * half) for k in ENDS]
-    yield from _around(smooth, terrain, rng, (6.0, 32.0), places)
+    yield from _around(smooth, waves, rng, (6.0, 32.0), places)
 
 
 def _low_box(rng: np.random.Generator) -> objects.Size:
