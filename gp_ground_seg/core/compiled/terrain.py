@@ -162,15 +162,16 @@ def _step_along(
             if not (allowed[c] and allowed[c - 1]):
                 continue
             over_steep = is_steep[c - 1] or is_steep[c]
-            if dr > largest_gap(r[c]):
-                is_taken = dr <= longest_gap(r[c]) and _goes_on(candidates, offsets[m], c)
-            else:
-                is_taken = can_step(dr, rise, STEEP)
+            is_taken = False
+            if dr <= largest_gap(r[c]):
                 if can_step(dr, rise, EVEN):
                     _join(walk.even, c - 1, c)
                 if can_step(dr, rise, gentle(over_steep)):
                     _step(walk, c - 1, c)
                     continue
+                is_taken = can_step(dr, rise, STEEP)
+            if not is_taken and dr <= longest_gap(r[c]):
+                is_taken = _goes_on(candidates, offsets[m], c)
             walk.is_fallen[c] = not is_taken and falls(dr, rise)
             is_end[c] = is_taken and not over_steep
             is_end_down[c] = walk.is_fallen[c] or (is_end[c] and rise < 0.0)

@@ -33,7 +33,8 @@ MAX_SLOPE, STEP_TOLERANCE = 0.84, 0.06
 GENTLE, STEEP, MIN_WIDTH = 0.3, 0.8, 6.0
 """Largest rise or fall of any step [m]; that of a step along a segment, if neighbouring segments
 have such a step too, over this width: more than the length of a car [m]. Such a front may also go
-down by any height, see `falls`: no object is lower than the ground that it stands on."""
+down by any height, see `falls`: no object is lower than the ground that it stands on. It may go on
+with the slope before it by any height too: few beams see a hillside in high steps."""
 LONG_GROWTH, MIN_SLOPE, SAME_SLOPE = 0.4, 0.06, 0.08
 """Growth with range of the longest step along a segment that goes on with the slope of the terrain
 before it [m/m], in such a front too; least slope of one, and difference to that before."""
@@ -181,7 +182,7 @@ class _Steps(NamedTuple):
     first: IntArray  # (S,) candidates at the near end, and
     second: IntArray  # (S,) at the other one
     length: FloatArray  # (S,) m
-    is_long: BoolArray  # (S,) longer than `largest_gap`, with the slope of the terrain before it
+    is_long: BoolArray  # (S,) longer or higher than others, with the slope of the terrain before it
     is_fall: BoolArray  # (S,) see `falls`
 
 
@@ -198,12 +199,13 @@ def _steps(candidates: Candidates, allowed: BoolArray) -> _Steps:
     dr, rise = np.diff(r), np.diff(z)
     before = np.searchsorted(key, key[:-1] - 0.5 * dr, side='right') - 1
     has_before = (before >= 0) & (segment[before] == segment[:-1])
-    is_far, can_be = dr > largest_gap(r[1:]), can_step(dr, rise, STEEP)
+    is_far = dr > largest_gap(r[1:])
+    is_odd = is_far | ~can_step(dr, rise, STEEP)
     with np.errstate(divide='ignore', invalid='ignore'):
         slope_before = (z[:-1] - z[before]) / (r[:-1] - r[before])
-        is_long = has_before & (dr <= longest_gap(r[1:])) & goes_on(rise / dr, slope_before)
-    is_long &= is_far
-    is_fall = ~is_long & (is_far | ~can_be) & falls(dr, rise)
+        is_as_before = has_before & goes_on(rise / dr, slope_before)
+    is_long = is_odd & (dr <= longest_gap(r[1:])) & is_as_before
+    is_fall = is_odd & ~is_long & falls(dr, rise)
     is_step = allowed[1:] & allowed[:-1] & (~is_far | is_long | is_fall)
     along = np.flatnonzero(is_step & (segment[1:] == segment[:-1]))
     parts = [(along, along + 1, dr[along])]
