@@ -97,8 +97,7 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
 
 def run_dump(arguments: argparse.Namespace) -> int:
     """Print the parameters as YAML, with the preset's reasons for the values it has given."""
-    config = options.read_config(arguments)
-    print(find_preset(arguments.preset).to_yaml(config), end='')
+    print(find_preset(arguments.preset).to_yaml(options.read_config(arguments)), end='')
     return 0
 
 

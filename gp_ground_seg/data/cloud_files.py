@@ -61,8 +61,7 @@ def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
     if clouds.coordinate_names(arrays)[0] not in arrays:
         table = arrays.pop(_table_of(arrays))
         arrays = {**clouds.scatter(_points_of(table)), **arrays}
-    first = next(iter(arrays.values()))
-    x = arrays.get(clouds.coordinate_names(arrays)[0], first)
+    x = arrays.get(clouds.coordinate_names(arrays)[0], next(iter(arrays.values())))
     fields = {name: v for name, v in arrays.items() if v.shape[:1] == x.shape[:1]}
     return clouds.gather(fields), {name: v for name, v in arrays.items() if name not in fields}
 

@@ -89,8 +89,7 @@ def name_columns(table: npt.NDArray[Any]) -> Fields:
 def gather(columns: Mapping[str, npt.NDArray[Any]]) -> Fields:
     """Structured array (N,), packed, of arrays (N, ...) by name."""
     types = [(name, values.dtype, values.shape[1:]) for name, values in columns.items()]
-    size = len(next(iter(columns.values()), ()))
-    fields = np.empty(size, dtype=types)
+    fields = np.empty(len(next(iter(columns.values()), ())), dtype=types)
     for name, values in columns.items():
         fields[name] = values
     return fields

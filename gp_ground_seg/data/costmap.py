@@ -26,15 +26,8 @@ from gp_ground_seg.core.ground_model import segment_of
 from gp_ground_seg.core.parameters.config import ANY_HEIGHT, Config
 from gp_ground_seg.core.pipeline.sensor_pose import LEAST_COSINE
 from gp_ground_seg.core.result import Segmentation, cached_property
+from gp_ground_seg.data import step_edges
 from gp_ground_seg.data.point_cloud2 import read_xyz
-from gp_ground_seg.data.step_edges import (
-    MARGIN,
-    SECTORS,
-    Edges,
-    across_sectors,
-    find_edges,
-    standing_level,
-)
 
 DIRECTIONS = 720
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -107,9 +100,9 @@ class SegmentedCloud:
         both = zip(stands, self._in_plane(*self._in_cloud(edges.points()).T), strict=True)
         x, y = (np.concatenate([a, b.astype(a.dtype)]) for a, b in both)
         ahead, left, _ = pose.origin
-        level = np.full(SECTORS, -pose.sensor_height)
+        level = np.full(step_edges.SECTORS, -pose.sensor_height)
         first, behind = (
-            ranges_of(*self._in_plane(*self._in_cloud(across_sectors(r, level)).T))[0]
+            ranges_of(*self._in_plane(*self._in_cloud(step_edges.across_sectors(r, level)).T))[0]
             for r in (edges.first, edges.behind)
         )
         # In the plane of the cloud turned as the frame of the edges is.
@@ -126,10 +119,10 @@ class SegmentedCloud:
         """
         pose = self.segmentation.pose
         xyz = self._about_sensor(pose.rotation)[self.is_ground]
-        return standing_level(xyz, pose.sensor_height) @ pose.rotation
+        return step_edges.standing_level(xyz, pose.sensor_height) @ pose.rotation
 
     @cached_property
-    def _found(self) -> Edges:
+    def _found(self) -> step_edges.Edges:
         found = self.segmentation
         limit, height = self.config.output.max_step_down, found.pose.sensor_height
         xyz, over = self._about_sensor(self._rotation), found.labelled.height
@@ -138,7 +131,7 @@ class SegmentedCloud:
         over = np.where(np.isnan(over), xyz[:, 2] + height, over)
         stands = (found.label == _OBSTACLE) & ~(over < 0.0)
         xyz[found.grid.cell == NOT_FINITE] = np.nan
-        return find_edges(xyz, self.is_ground, stands, limit, height)
+        return step_edges.find_edges(xyz, self.is_ground, stands, limit, height)
 
     def _about_sensor(self, turn: FloatArray) -> FloatArray:
         """All points about the sensor, where rays begin, turned by a matrix, (N, 3) [m]."""
@@ -202,7 +195,7 @@ def scan_ranges(obstacles: Places | Blocked, returns: Places) -> Ranges:
     is_seen[direction_of(*returns)] = True
     ranges[~is_seen] = np.nan
     if isinstance(obstacles, Blocked):
-        is_behind = MARGIN * ranges > obstacles.first
+        is_behind = step_edges.MARGIN * ranges > obstacles.first
         ranges[is_behind | (np.isinf(ranges) & (obstacles.behind < np.inf))] = np.nan
     return ranges
 

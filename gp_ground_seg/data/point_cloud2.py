@@ -19,6 +19,7 @@ from numpy.lib.recfunctions import repack_fields
 from numpy.lib.stride_tricks import as_strided
 
 from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.frame import PointArray
 from gp_ground_seg.core.pipeline.points import finite_points, single_precision
 from gp_ground_seg.data.clouds import distinct
 
@@ -51,9 +52,7 @@ def stamp_of(header: Any) -> int:
     return int(10**9 * header.stamp.sec + header.stamp.nanosec)
 
 
-def read_xyz(
-    cloud: CloudMessage, *, is_single: bool = False
-) -> npt.NDArray[np.float32] | npt.NDArray[np.float64]:
+def read_xyz(cloud: CloudMessage, *, is_single: bool = False) -> PointArray:
     """Coordinates of every point, row by row, in native byte order, (height * width, 3).
 
     They may lie in the data of the cloud, read-only. float64 if one of the three is FLOAT64 and
@@ -107,8 +106,7 @@ def read_fields(cloud: CloudMessage) -> npt.NDArray[np.void]:
             'itemsize': cloud.point_step,
         }
     )
-    points = _view(cloud, dtype).reshape(-1)
-    return points.astype(repack_fields(dtype.newbyteorder('=')))
+    return _view(cloud, dtype).reshape(-1).astype(repack_fields(dtype.newbyteorder('=')))
 
 
 def append_columns(

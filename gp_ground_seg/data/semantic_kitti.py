@@ -19,6 +19,8 @@ GROUND_CLASSES = (40, 44, 48, 49, 60, 72)
 """Road, parking, sidewalk, other ground, lane marking, terrain."""
 FRAME_PERIOD = 0.1  # time between frames [s] where a sequence has no times.txt
 _MAX_TIMES_BYTES = 1 << 24
+Entries = npt.NDArray[np.uint32]
+"""Of a ``.label`` file, (N,): class below, instance in the upper 16 bits."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class Frame:
         return read_file(self.points_path, self.columns).xyz
 
     @property
-    def entries(self) -> npt.NDArray[np.uint32]:
+    def entries(self) -> Entries:
         """Entry of each point, as `read_entries`; DataError without a file of labels that fits."""
         if self.labels_path is None:
             raise DataError(f'{self.points_path}: has no labels')
@@ -147,8 +149,8 @@ def _read_times(path: Path, frames: Sequence[Path]) -> list[float]:
     return [float(time) for time in times]
 
 
-def read_entries(path: str | Path, n_points: int) -> npt.NDArray[np.uint32]:
-    """Entries of a ``.label`` file, (n_points,): class below, instance in the upper 16 bits.
+def read_entries(path: str | Path, n_points: int) -> Entries:
+    """Entries of a ``.label`` file, (n_points,).
 
     DataError if it cannot be read, or has another number.
     """

@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,11 +46,9 @@ LEGENDS = {
 
 def read_view(item: Input, labels: str | None = None) -> KnownScan:
     """Read a scan, and its labels: a file, or that of SemanticKITTI next to it."""
-    points, path = item.read().xyz, labels
-    beside = item.path.parent.parent / 'labels' / f'{item.name}.label'
-    if path is None and item.path.parent.name == 'velodyne' and beside.exists():
-        path = str(beside)
-    if path is None:
+    points, folder = item.read().xyz, item.path.parent
+    path = Path(labels or folder.parent / 'labels' / f'{item.name}.label')
+    if labels is None and not (folder.name == 'velodyne' and path.exists()):
         return KnownScan('', item.name, points)
     return labelled_scan('', item.name, points, read_entries(path, len(points)))
 

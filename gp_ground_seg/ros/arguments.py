@@ -13,13 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.core.errors import ConfigError, GroundSegError, shown
+from gp_ground_seg.core.parameters import schema
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.parameters.schema import (
-    FORM_OF_ROS,
-    ROS_PARAMETERS_KEY,
-    read_yaml,
-    sections_of,
-)
 
 _HIGHEST = {
     'ROS_DOMAIN_ID': 232,
@@ -92,9 +87,9 @@ def _check_surroundings(words: Sequence[str]) -> None:
         raise ConfigError(f'no folder for logs, as HOME is not set: {LOG_FOLDER}')
     for path in _parameter_files(words):
         try:
-            document = read_yaml(path)
-            if document and not sections_of(document):
-                raise ConfigError(f'no {ROS_PARAMETERS_KEY}, which {FORM_OF_ROS}')
+            document = schema.read_yaml(path)
+            if document and not schema.sections_of(document):
+                raise ConfigError(f'no {schema.ROS_PARAMETERS_KEY}, which {schema.FORM_OF_ROS}')
         except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error
 
@@ -144,7 +139,7 @@ def unused_files(words: Sequence[str], node_name: str) -> list[str]:
     for path in _parameter_files(words):
         keys: list[str] = []
         with contextlib.suppress(ConfigError):  # it was read before, and may be gone
-            keys = [key for key, _ in sections_of(read_yaml(path))]
+            keys = [key for key, _ in schema.sections_of(schema.read_yaml(path))]
         # Of what rclpy reads for a node, ``*`` is any word, ``**`` several; rcl has accepted the
         # rest of the keys: letters, digits, _ and / only.
         rooted = [f'/{key.removeprefix("/")}'.replace('/*', r'(/\w+)') for key in keys]

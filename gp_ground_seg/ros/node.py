@@ -22,19 +22,14 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
+from gp_ground_seg.core import errors
 from gp_ground_seg.core.backend import NumpyBackend, choose_backend
-from gp_ground_seg.core.errors import (
-    GroundSegError,
-    PointCloudError,
-    in_one_line,
-    messages_passed_to,
-    shown,
-)
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
+from gp_ground_seg.ros import transforms
 from gp_ground_seg.ros.arguments import initialize, start_errors, unused_files, with_file
 from gp_ground_seg.ros.diagnostics import Diagnostics, by_what_was_set, kept_height
 from gp_ground_seg.ros.input import STEADY_CLOCK, THROTTLED, CloudSubscription
@@ -42,15 +37,7 @@ from gp_ground_seg.ros.loader import CHANGED, FOLLOWS, STAYS, BackendLoader
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
 from gp_ground_seg.ros.session import StopRequest, large_cloud_transport, stop_on_signals
-from gp_ground_seg.ros.transforms import (
-    NO_FRAMES,
-    Found,
-    FrameListener,
-    KeptPose,
-    check_tf2,
-    find_module,
-    is_tf_used,
-)
+from gp_ground_seg.ros.transforms import NO_FRAMES, Found, FrameListener, KeptPose
 
 # Time between heartbeats [s], the same as in Nav2's own nodes: the manager connects after the
 # first, and waits half of its bond_timeout for one.
@@ -80,7 +67,7 @@ class GroundSegmentationNode(ConfiguredNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(NODE_NAME, **options)
         self._library_log = ExitStack()
-        self._library_log.enter_context(messages_passed_to(self._pass_on))
+        self._library_log.enter_context(errors.messages_passed_to(self._pass_on))
         self._frames: FrameListener | None = None
         # A guard condition runs in the executor, between two callbacks.
         self._loaded = self.create_guard_condition(self._change_backend)
@@ -98,8 +85,7 @@ class GroundSegmentationNode(ConfiguredNode):
         self._loader: BackendLoader | None = None
 
     def _start(self) -> None:
-        logger = self.get_logger()
-        logger.info(describe(self.config, self.get_fully_qualified_name()))
+        self.get_logger().info(describe(self.config, self.get_fully_qualified_name()))
         with start_errors():
             self._outputs = OutputPublishers(self)
             self._input = CloudSubscription(
@@ -155,9 +141,9 @@ class GroundSegmentationNode(ConfiguredNode):
     def _refuse(self, cloud: PointCloud2, error: Exception) -> None:
         if not self.context.ok():
             return  # publishing failed because the process ends
-        is_bad = isinstance(error, PointCloudError)
-        said = str(error) if is_bad else f'{type(error).__name__}: {in_one_line(error)}'
-        reason = shown(said)  # it may hold names of frames and fields
+        is_bad = isinstance(error, errors.PointCloudError)
+        said = str(error) if is_bad else f'{type(error).__name__}: {errors.in_one_line(error)}'
+        reason = errors.shown(said)  # it may hold names of frames and fields
         self._diagnostics.input.refused(reason)
         self.get_logger().error(
             f'cloud on {self._input.topic} in frame {cloud.header.frame_id!r} refused: {reason}',
@@ -167,7 +153,7 @@ class GroundSegmentationNode(ConfiguredNode):
     def check_config(self, config: Config) -> None:
         """Raise a GroundSegError if the backend or TF is asked for and not installed."""
         choose_backend(config.runtime.backend)
-        check_tf2(config)
+        transforms.check_tf2(config)
 
     def apply_config(self, config: Config) -> None:
         """Use `config` from the next cloud on; compiled code as soon as that is made."""
@@ -215,7 +201,7 @@ class GroundSegmentationNode(ConfiguredNode):
         if self._frames is not None and config.frame != self._frames.config.frame:
             self._frames.close()
             self._frames = None
-        if self._frames is None and (config.frame.level == 'imu' or is_tf_used(config)):
+        if self._frames is None and (config.frame.level == 'imu' or transforms.is_tf_used(config)):
             self._frames = FrameListener(self, config, self._on_cloud)
         self._input.callback = self._frames.hold if self._frames else self._on_cloud
 
@@ -259,7 +245,7 @@ class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[m
             return change(request, response)
         except RuntimeError:  # of rcl
             response.success = False
-            wanted = f'{request.transition.id} {shown(request.transition.label)}'.strip()
+            wanted = f'{request.transition.id} {errors.shown(request.transition.label)}'.strip()
             text = f'transition {wanted} refused: it is not possible in the present state'
             self.get_logger().warning(text, **THROTTLED)
             return response
@@ -283,7 +269,7 @@ class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[m
         if self._heartbeat is not None:
             self._heartbeat.stop()
             self._heartbeat = None
-        if is_active and (bond := find_module('bond.msg')) is not None:
+        if is_active and (bond := transforms.find_module('bond.msg')) is not None:
             self._heartbeat = Heartbeat(self, bond.Status)
         elif is_active:
             self.get_logger().info(NO_BOND)
@@ -356,7 +342,7 @@ def _spin(node: GroundSegmentationNode, stop: StopRequest) -> None:
         except Exception as error:
             # Of a callback, or of rclpy itself: at a negative time on /clock, for example.
             if rclpy.ok():
-                reason = f'{type(error).__name__}: {shown(in_one_line(error))}'
+                reason = f'{type(error).__name__}: {errors.shown(errors.in_one_line(error))}'
                 node.get_logger().error(reason, **THROTTLED)
 
 
@@ -374,9 +360,9 @@ def main(args: Sequence[str] | None = None, *, is_managed: bool = False) -> int:
                 node.get_logger().warning(line)
             _spin(node, stop)
             node.get_logger().info(f'ends: {node._diagnostics.summary()}')
-        except GroundSegError as error:
+        except errors.GroundSegError as error:
             problem = with_file(str(error), words)
-            sys.stderr.write(f'{NODE_NAME}: error: {shown(problem)}\n')
+            sys.stderr.write(f'{NODE_NAME}: error: {errors.shown(problem)}\n')
             return 2
         finally:
             if node is not None:

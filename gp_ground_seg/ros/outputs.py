@@ -15,22 +15,9 @@ from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 
 from gp_ground_seg.core.frame import NOT_FINITE, BoolArray
 from gp_ground_seg.core.ground_model import GroundModel
-from gp_ground_seg.data.costmap import (
-    DIRECTIONS,
-    SegmentedCloud,
-    occupancy,
-    reach_of_model,
-    scan_ranges,
-)
-from gp_ground_seg.data.point_cloud2 import (
-    append_columns,
-    message_bytes,
-    message_data,
-    read_columns,
-    read_xyz,
-    select_points,
-    stamp_of,
-)
+from gp_ground_seg.data import costmap, point_cloud2
+from gp_ground_seg.data.costmap import SegmentedCloud
+from gp_ground_seg.data.point_cloud2 import message_bytes, message_data, read_xyz, select_points
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
@@ -70,7 +57,7 @@ def labelled_cloud(segmented: SegmentedCloud) -> PointCloud2:
         values = getattr(segmented.segmentation, field)
         with np.errstate(over='ignore'):
             columns[name] = values if field == 'label' else values.astype(np.float32, copy=False)
-    placed, step, data = append_columns(cloud, columns)
+    placed, step, data = point_cloud2.append_columns(cloud, columns)
     message = copy(cloud)
     message.fields = [
         *cloud.fields,
@@ -122,7 +109,7 @@ def read_ground_model(cloud: PointCloud2) -> GroundModel:
     `cloud` is a message of rclpy, or one with the same attributes, such as that of rosbags. Raises
     a PointCloudError if a field is missing, or if the points are not such a grid.
     """
-    return GroundModel.from_columns(read_columns(cloud, MODEL_FIELDS))
+    return GroundModel.from_columns(point_cloud2.read_columns(cloud, MODEL_FIELDS))
 
 
 def scan(segmented: SegmentedCloud) -> LaserScan:
@@ -131,12 +118,12 @@ def scan(segmented: SegmentedCloud) -> LaserScan:
     Infinite where the direction has returns and no obstacle, NaN where it has no return. Edges of
     drops are obstacles if ``output.max_step_down`` is not 0, and NaN is what they may hide.
     """
-    step = 2.0 * math.pi / DIRECTIONS
+    step = 2.0 * math.pi / costmap.DIRECTIONS
     message = LaserScan(header=segmented.cloud.header, angle_increment=step)
     message.angle_min, message.angle_max = 0.5 * step - math.pi, math.pi - 0.5 * step
     message.range_max = segmented.config.grid.r_max
     returns = segmented.places(segmented.segmentation.grid.cell != NOT_FINITE)
-    message.ranges = message_data(scan_ranges(segmented.blocked, returns), 'f')
+    message.ranges = message_data(costmap.scan_ranges(segmented.blocked, returns), 'f')
     return message
 
 
@@ -144,8 +131,8 @@ def occupancy_grid(segmented: SegmentedCloud) -> OccupancyGrid:
     """Return the cells about the origin of the cloud: free, occupied or unknown."""
     output, ground_std = segmented.config.output, segmented.config.label.ground_tolerance
     ground, obstacles = segmented.places(segmented.is_ground), segmented.blocked
-    reach = reach_of_model(segmented.segmentation.surface, segmented.heading, ground_std)
-    cells = occupancy(ground, obstacles, reach, output.cell_size, output.grid_size)
+    reach = costmap.reach_of_model(segmented.segmentation.surface, segmented.heading, ground_std)
+    cells = costmap.occupancy(ground, obstacles, reach, output.cell_size, output.grid_size)
     message = OccupancyGrid(header=segmented.cloud.header)
     info = message.info
     info.map_load_time, info.resolution = message.header.stamp, output.cell_size
@@ -196,7 +183,7 @@ class OutputPublishers:
 
     def publish(self, segmented: SegmentedCloud) -> None:
         """Publish all outputs of a cloud, or none if one cannot be built."""
-        seconds = 1e-9 * stamp_of(segmented.cloud.header)
+        seconds = 1e-9 * point_cloud2.stamp_of(segmented.cloud.header)
         period, self._stamp = seconds - self._stamp, seconds
         messages = [
             (publisher, output.build(segmented))

@@ -379,7 +379,7 @@ def test_own_level_behind_a_ditch_is_free():
 
 def test_off_nothing_is_looked_for(monkeypatch):
     off = segmented(drop(6.0, 0.6), MOUNTED['hdl-64e'], **{'output.max_step_down': 0.0})
-    monkeypatch.setattr(costmap, 'find_edges', None)
+    monkeypatch.setattr(step_edges, 'find_edges', None)
     assert Config().output.max_step_down == 0.0
     for place, obstacle in zip(off.blocked, off.places(off.is_obstacle), strict=True):
         np.testing.assert_array_equal(place, obstacle)

@@ -10,17 +10,10 @@ from cli_runner import run
 from evaluation_samples import scores_of, street, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.lab.scoring import tables
 from gp_ground_seg.lab.scoring.metrics import height_sums
 from gp_ground_seg.lab.scoring.objects import SHARES
 from gp_ground_seg.lab.scoring.report import records
-from gp_ground_seg.lab.scoring.tables import (
-    COMPARED,
-    MEASURES,
-    clusters,
-    difference_table,
-    interval_note,
-    interval_text,
-)
 
 
 def sequences_of(*hits, of=100, n_frames=1):
@@ -33,7 +26,7 @@ def sequences_of(*hits, of=100, n_frames=1):
 
 
 def text(ours, theirs):
-    return interval_text(scores_of(a=ours, b=theirs), 'b', MEASURES['iou'])
+    return tables.interval_text(scores_of(a=ours, b=theirs), 'b', tables.MEASURES['iou'])
 
 
 def interval(ours, theirs):
@@ -86,26 +79,30 @@ def test_rows_of_a_part_are_drawn_by_the_clusters_of_all_scans():
     emptied = [[{**row, **nothing} if row['sequence'] == '5' else row for row in its]
                for its in (ours, theirs)]  # fmt: skip
     assert (
-        interval_text(scores, 'b', MEASURES['iou'], part) == text(*emptied) != text(ours, theirs)
+        tables.interval_text(scores, 'b', tables.MEASURES['iou'], part)
+        == text(*emptied)
+        != text(ours, theirs)
     )
 
 
 def test_of_a_single_sequence_blocks_of_successive_frames_are_drawn():
     for n, sizes in ((1, [1]), (9, [9]), (10, [5, 5]), (23, [5, 6, 6, 6]), (500, [50] * 10)):
         scores = scores_of(a=sequences_of(50, n_frames=n))
-        parts = clusters(scores)
+        parts = tables.clusters(scores)
         assert parts.groupby('cluster').size().tolist() == sizes
         assert parts['cluster'].is_monotonic_increasing
         assert parts['index'].tolist() == [*map(str, range(n))]
         found = 'blocks of successive frames' if n >= 10 else 'they need two sequences'
-        assert found in interval_note(scores)
+        assert found in tables.interval_note(scores)
     scores = scores_of(a=[
         {'sequence': 'vlp-16 kerb', 'index': str(k), 'cluster': f'kerb {k % 3}'} for k in range(6)
     ])  # fmt: skip
-    parts = {name: own.tolist() for name, own in clusters(scores).groupby('cluster')['index']}
+    parts = {
+        name: own.tolist() for name, own in tables.clusters(scores).groupby('cluster')['index']
+    }
     assert parts == {'kerb 0': ['0', '3'], 'kerb 1': ['1', '4'], 'kerb 2': ['2', '5']}
-    assert 'bootstrap over 3 scenes (few: too narrow)' in interval_note(scores)
-    assert 'few' not in interval_note(scores_of(a=sequences_of(*range(20))))
+    assert 'bootstrap over 3 scenes (few: too narrow)' in tables.interval_note(scores)
+    assert 'few' not in tables.interval_note(scores_of(a=sequences_of(*range(20))))
 
 
 def rows_of(*frames, n_changed=0):
@@ -139,9 +136,9 @@ DIFFERENCES = {
 def test_differences_by_hand():
     ours = rows_of((85, 0.1, 0.1), (99, 0.3, 0.1))
     other = rows_of((80, 0.1, -0.2), (90, 0.0, 0.0), n_changed=30)
-    table = difference_table(scores_of(ours=ours, x=other))
+    table = tables.difference_table(scores_of(ours=ours, x=other))
     rows = {row['measure']: row for row in records(table.frame)}
-    assert list(rows) == [*COMPARED.values()]
+    assert list(rows) == [*tables.COMPARED.values()]
     for name, (given, peer, interval) in DIFFERENCES.items():
         found = rows[name]
         assert (found['given'], found['peer']) == pytest.approx((given, peer)), name
@@ -151,7 +148,7 @@ def test_differences_by_hand():
     assert re.search(r'IoU \[%\] +92.00 +85.00 +\+7.00 +\+5.00 to \+9.00', table.text())
     said = 'points with two labels: 15.00%; most in 08/0 (30.00%), 00/0 (0.00%); '
     assert said in table.title
-    alone = difference_table(scores_of(ours=ours[:1], x=other[:1]))
+    alone = tables.difference_table(scores_of(ours=ours[:1], x=other[:1]))
     assert 'no intervals: they need two sequences' in alone.title
     assert alone.frame['interval'].isna().all()
 

@@ -12,18 +12,6 @@ from matplotlib.image import imread
 
 from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.lab import plotting
-from gp_ground_seg.lab.plotting import (
-    CAMERA,
-    COLOURS,
-    TARGET,
-    ZOOM,
-    SegmentView,
-    camera_at,
-    label_layers,
-    plot_scan_view,
-    plot_segment,
-    project,
-)
 
 SEGMENT = 90
 ROAD, BUILDING = 40, 50
@@ -85,28 +73,28 @@ def test_labels_and_errors_are_where_the_points_are(tmp_path):
     points = np.concatenate([patch(*place) for place in places.values()])
     points[-1, 2] = np.nan
     label, truth = repeat([1, 2, 1, 2]), repeat([1, 0, 2, 1])
-    plot_scan_view(points, label, tmp_path / 'a.png', truth=truth)
+    plotting.plot_scan_view(points, label, tmp_path / 'a.png', truth=truth)
     for name, (x, y) in places.items():
-        centre, n = where(tmp_path / 'a.png', COLOURS[name])
+        centre, n = where(tmp_path / 'a.png', plotting.COLOURS[name])
         assert n > 300
-        np.testing.assert_allclose(centre, project(np.array([x, y, -1.75]))[0], atol=0.01)
+        np.testing.assert_allclose(centre, plotting.project(np.array([x, y, -1.75]))[0], atol=0.01)
     # A room is drawn as large as a street.
-    plot_scan_view(0.1 * points, label, tmp_path / 'a.png', truth=truth)
-    assert all(where(tmp_path / 'a.png', COLOURS[name])[1] > 300 for name in places)
+    plotting.plot_scan_view(0.1 * points, label, tmp_path / 'a.png', truth=truth)
+    assert all(where(tmp_path / 'a.png', plotting.COLOURS[name])[1] > 300 for name in places)
     # Without the truth, and from above.
-    above = camera_at(0, 89, 60)
-    plot_scan_view(points, label, tmp_path / 'a.png', camera=above)
-    assert where(tmp_path / 'a.png', COLOURS['missed ground'])[1] == 0
-    assert where(tmp_path / 'a.png', COLOURS['obstacle'])[1] > 1000
+    above = plotting.camera_at(0, 89, 60)
+    plotting.plot_scan_view(points, label, tmp_path / 'a.png', camera=above)
+    assert where(tmp_path / 'a.png', plotting.COLOURS['missed ground'])[1] == 0
+    assert where(tmp_path / 'a.png', plotting.COLOURS['obstacle'])[1] > 1000
 
 
 def test_counts_are_in_words():
     label = np.array([0, 1, 1, 2, 2, 2], dtype=np.uint8)
     truth = np.array([1, 1, 2, 1, 2, 0], dtype=np.uint8)
-    words = [label_layers(label)[0], label_layers(label[1:])[0]]
+    words = [plotting.label_layers(label)[0], plotting.label_layers(label[1:])[0]]
     assert words == ['6 points: 2 ground, 3 obstacle, 1 unknown', '5 points: 2 ground, 3 obstacle']
-    assert label_layers(label, truth)[0] == '1 false ground, 2 missed ground, IoU 25.00 %'
-    assert label_layers(label[:0], truth[:0])[0] == '0 false ground, 0 missed ground'
+    assert plotting.label_layers(label, truth)[0] == '1 false ground, 2 missed ground, IoU 25.00 %'
+    assert plotting.label_layers(label[:0], truth[:0])[0] == '0 false ground, 0 missed ground'
 
 
 @pytest.mark.parametrize(
@@ -116,23 +104,23 @@ def test_clouds_with_nothing_to_see(tmp_path, points):
     result, path = GroundSegmenter().segment(points), tmp_path / 'a.png'
     path.write_text('old')
     for truth in (result.label, None):
-        plot_scan_view(points, result.label, path, r'$\nothing _ %', truth=truth)
+        plotting.plot_scan_view(points, result.label, path, r'$\nothing _ %', truth=truth)
         assert imread(path).ndim == 3
-        plot_segment(result, points, [SEGMENT], path, truth, title=r'$\none _ %')
+        plotting.plot_segment(result, points, [SEGMENT], path, truth, title=r'$\none _ %')
         assert imread(path).ndim == 3
     assert [*tmp_path.iterdir()] == [path]
 
 
 def test_camera_projects_as_a_camera_does():
-    forward = np.subtract(TARGET, CAMERA)
+    forward = np.subtract(plotting.TARGET, plotting.CAMERA)
     forward /= np.linalg.norm(forward)
     right = np.array([forward[1], -forward[0], 0.0])
     right /= np.linalg.norm(right)
     up = np.cross(right, forward)
     assert up[2] > 0.0
     seen = [(10, 0, 0), (10, 2, 0), (10, 0, 4), (20, 0, 4), (-5, 0, 0)]
-    place, depth = project(CAMERA + np.array(seen) @ [forward, right, up])
-    expected = ZOOM * np.array([(0, 0), (0.2, 0), (0, 0.4), (0, 0.2)])
+    place, depth = plotting.project(plotting.CAMERA + np.array(seen) @ [forward, right, up])
+    expected = plotting.ZOOM * np.array([(0, 0), (0.2, 0), (0, 0.4), (0, 0.2)])
     np.testing.assert_allclose(place[:4], expected, atol=1e-12)
     np.testing.assert_allclose(depth, [10, 10, 10, 20, -5])
     assert np.isnan(place[4]).all()
@@ -140,12 +128,14 @@ def test_camera_projects_as_a_camera_does():
 
 def test_a_camera_stands_where_it_is_told():
     # The direction of the default is that of the command's --help.
-    np.testing.assert_allclose(camera_at(196, 24, 32), CAMERA, atol=0.3)
+    np.testing.assert_allclose(plotting.camera_at(196, 24, 32), plotting.CAMERA, atol=0.3)
     # From the left what is ahead is to the left; from ahead what is left is to the right.
-    ahead, left = np.add(TARGET, (5, 0, 0)), np.add(TARGET, (0, 5, 0))
-    assert project(ahead, camera_at(90, 0, 20))[0][0] == pytest.approx(-0.25 * ZOOM)
-    assert project(left, camera_at(0, 10, 20))[0][0] > 0.2 * ZOOM
-    assert project(left, camera_at(0, 10, 40))[0][0] < 0.2 * ZOOM
+    ahead, left = np.add(plotting.TARGET, (5, 0, 0)), np.add(plotting.TARGET, (0, 5, 0))
+    assert plotting.project(ahead, plotting.camera_at(90, 0, 20))[0][0] == pytest.approx(
+        -0.25 * plotting.ZOOM
+    )
+    assert plotting.project(left, plotting.camera_at(0, 10, 20))[0][0] > 0.2 * plotting.ZOOM
+    assert plotting.project(left, plotting.camera_at(0, 10, 40))[0][0] < 0.2 * plotting.ZOOM
 
 
 def test_pdf_and_svg_hold_points_as_pixels(scan, tmp_path):
@@ -161,10 +151,10 @@ def test_command_draws_a_scan_and_its_errors(scan, tmp_path, capsys):
     assert run('plot', 'scan', scan, '-o', path) == 0
     said = r'sensor: .*\n[\d ]+ points: [\d ]+ ground, [\d ]+ obstacle, written to .*a\.png\n'
     assert re.fullmatch(said, capsys.readouterr().out)
-    assert where(path, COLOURS['missed ground'])[1] == 0
+    assert where(path, plotting.COLOURS['missed ground'])[1] == 0
     words = ['--labels', scan.with_suffix('.label'), '-o', path, '--force']
     assert run('plot', 'scan', scan, *words) == 0
-    assert where(path, COLOURS['missed ground'])[1] > 10
+    assert where(path, plotting.COLOURS['missed ground'])[1] > 10
 
 
 # Segments from the side.
@@ -185,8 +175,8 @@ def test_command_draws_segments_side_by_side(scan, tmp_path, capsys):
     # Both panels, without the legend.
     left, right = np.split(imread(path)[..., :3], [972, 1880], axis=1)[:2]
     for name in ('ground', 'obstacle', 'missed ground'):
-        assert close_to(left, COLOURS[name], 0.01).sum() > 10
-    assert not close_to(right, COLOURS['obstacle'], 0.01).any()
+        assert close_to(left, plotting.COLOURS[name], 0.01).sum() > 10
+    assert not close_to(right, plotting.COLOURS['obstacle'], 0.01).any()
 
 
 def test_what_is_drawn_is_the_result():
@@ -194,7 +184,7 @@ def test_what_is_drawn_is_the_result():
     points = hilly_scan().astype(np.float32)
     result = GroundSegmenter().segment(points)
     above, below = Figure().subplots(2)
-    view = SegmentView(result, SEGMENT, points[:, 2])
+    view = plotting.SegmentView(result, SEGMENT, points[:, 2])
     view.draw_ground(above)
     view.draw_length_scale(below)
 

@@ -14,16 +14,6 @@ from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.lab import tuner as page
 from gp_ground_seg.lab.scoring.evaluate import MethodResult, score_scan
-from gp_ground_seg.lab.tuner import (
-    Tuner,
-    _table,
-    open_server,
-    palette,
-    point_colours,
-    read_view,
-    slider_range,
-    tunable,
-)
 
 pytestmark = pytest.mark.usefixtures('compiled_code')
 
@@ -34,9 +24,9 @@ def test_colours_are_those_of_the_legends():
     points = simulated('urban').points.copy()
     points[0, 0] = np.nan
     label, n = GroundSegmenter().segment(points).label, len(points)
-    by_class = point_colours('class', label, label)
-    assert np.array_equal(by_class, palette('class')[label])
-    unknown, ground, obstacle = palette('class')
+    by_class = page.point_colours('class', label, label)
+    assert np.array_equal(by_class, page.palette('class')[label])
+    unknown, ground, obstacle = page.palette('class')
     assert (by_class[0] == unknown).all() and not (ground == obstacle).all()
 
     before = label.copy()
@@ -44,11 +34,11 @@ def test_colours_are_those_of_the_legends():
     before[[first, second]] = Label.OBSTACLE, Label.GROUND
     others = np.delete(np.arange(n), [0, first, second])
     for name in ('changes', 'errors'):
-        colours = point_colours(name, label, before)
-        assert np.array_equal(colours[[first, second]], palette(name))
+        colours = page.point_colours(name, label, before)
+        assert np.array_equal(colours[[first, second]], page.palette(name))
         assert np.array_equal(colours[others], by_class[others])
     before[first] = Label.UNKNOWN
-    assert np.array_equal(point_colours('errors', label, before)[first], ground)
+    assert np.array_equal(page.point_colours('errors', label, before)[first], ground)
 
 
 def test_scores_of_labels(tmp_path):
@@ -58,28 +48,28 @@ def test_scores_of_labels(tmp_path):
     points.tofile(tmp_path / 'a.bin')
     np.repeat([ROAD, CAR], [1600, 20]).astype('<u4').tofile(tmp_path / 'b.label')
     (item,) = list_inputs(tmp_path / 'a.bin')
-    assert read_view(item).truth is None
-    view = read_view(item, str(tmp_path / 'b.label'))
+    assert page.read_view(item).truth is None
+    view = page.read_view(item, str(tmp_path / 'b.label'))
     result = GroundSegmenter().segment(view.points)
     right = np.repeat([Label.GROUND, Label.OBSTACLE], [1600, 20]).astype(np.uint8)
     for label, n_lost, iou in ((np.full(1620, Label.GROUND), 1, 1600 / 1620), (right, 0, 1.0)):
         (sums,) = score_scan(view, MethodResult(label, result.ground_z))['scans']
-        rows = _table(result, right, [sums, sums]).splitlines()
+        rows = page._table(result, right, [sums, sums]).splitlines()
         assert f'| objects lost | {n_lost} of 1 | {n_lost} of 1 |' in rows
         assert f'| IoU | {100.0 * iou:.2f} % | {100.0 * iou:.2f} % |' in rows
 
 
 def test_a_slider_goes_through_accepted_values_and_holds_the_one_at_hand():
-    for spec in (spec for spec in tunable() if spec.type in (int, float)):
-        low, high, step = slider_range(spec, spec.default)
+    for spec in (spec for spec in page.tunable() if spec.type in (int, float)):
+        low, high, step = page.slider_range(spec, spec.default)
         assert [spec.check(value) for value in (low, high)] == [low, high]
         assert 0 < step < high - low
         assert spec.default == 'auto' or low <= spec.default <= high
     spec = find_spec('label.ground_tolerance')
-    low, high, step = slider_range(spec, 0.1234)
+    low, high, step = page.slider_range(spec, 0.1234)
     assert (low, high, step) == pytest.approx((0.02, 0.5, 1e-4))
-    assert slider_range(spec, 3.0)[1] == 3.0
-    assert slider_range(find_spec('sensor.roll'), 'auto')[:2] == (-0.3, 0.3)
+    assert page.slider_range(spec, 3.0)[1] == 3.0
+    assert page.slider_range(find_spec('sensor.roll'), 'auto')[:2] == (-0.3, 0.3)
 
 
 @pytest.fixture
@@ -91,8 +81,8 @@ def viser():
 def test_what_is_set_on_the_page_is_the_configuration(sequence):
     names = ['sensor.height', 'learning.mode', 'grid.n_segments']
     config = Config().replace(**{'sensor.height': 1.5, 'grid.n_segments': 90})
-    with open_server(0) as (server, _):
-        tuner = Tuner(server, list_inputs(sequence), config, names)
+    with page.open_server(0) as (server, _):
+        tuner = page.Tuner(server, list_inputs(sequence), config, names)
         assert tuner.config == config
         shown = {h.label: h for h in server.gui._gui_input_handle_from_uuid.values()}
         shown['auto'].value = True
@@ -107,8 +97,8 @@ def test_what_is_set_on_the_page_is_the_configuration(sequence):
 @pytest.mark.usefixtures('viser')
 def test_the_tuner_draws_the_labels_of_its_parameters(sequence):
     name = 'label.ground_tolerance'
-    with open_server(0) as (server, _):
-        tuner = Tuner(server, list_inputs(sequence), Config(), [name])
+    with page.open_server(0) as (server, _):
+        tuner = page.Tuner(server, list_inputs(sequence), Config(), [name])
         assert tuner.config == Config()
         for tolerance, changed in ((Config()[name], '0 changed: 0 now ground'), (0.01, 'changed')):
             tuner.show(0, 'changes', Config().replace(**{name: tolerance}))
@@ -127,15 +117,15 @@ def test_a_server_that_cannot_be_guarded_is_refused():
 
 @pytest.mark.usefixtures('viser')
 def test_the_next_free_port_is_taken_and_said(caplog):
-    with open_server(0) as (server, _):
+    with page.open_server(0) as (server, _):
         port = server.get_port()
-        with open_server(port) as (_, address):
+        with page.open_server(port) as (_, address):
             assert f':{port}/' not in address
     (said,) = caplog.messages
     assert re.fullmatch(rf'port {port} is in use: \d+ instead', said)
     with (
         pytest.raises(DataError, match=r'--port 65536: must be at most 64535'),
-        open_server(65536),
+        page.open_server(65536),
     ):
         pass
 

@@ -18,11 +18,11 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.backend import Backend
 from gp_ground_seg.core.errors import PointCloudError, shown
-from gp_ground_seg.core.frame import FloatArray, Label
+from gp_ground_seg.core.frame import FloatArray, Label, PointArray
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.semantic_kitti import VEGETATION, Frame
+from gp_ground_seg.data.semantic_kitti import VEGETATION, Entries, Frame
 from gp_ground_seg.lab.cluster import HERE, Progress, Runner
 from gp_ground_seg.lab.scoring import metrics, objects
 from gp_ground_seg.lab.scoring.metrics import COUNTS, Labels
@@ -36,7 +36,6 @@ POSE = ('height', 'height_estimated', 'roll', 'pitch')
 """What is reported of the learning and of the sensor in a scan of ours; angles in radians."""
 STAGE = 'stage_'
 """Beginning of the columns with the seconds of a stage of ours."""
-Points = npt.NDArray[np.floating]
 Mount = tuple[float | None, Sequence[float]]
 """Height of a sensor over the ground, if known, and its place in the frame of the cloud [m]."""
 
@@ -75,7 +74,7 @@ class Method(Protocol):
         """Forget what was learned from earlier scans, if anything is; `scan` is the next."""
         return
 
-    def run(self, points: Points) -> None:
+    def run(self, points: PointArray) -> None:
         """Segment a scan of (N, 4) x, y, z, intensity: the part that is timed."""
 
     def result(self) -> MethodResult | Segmentation:
@@ -92,7 +91,7 @@ class OurMethod(Method):
         """Send the configuration to a worker."""
         return type(self), (self._segmenter.config, self.name)
 
-    def run(self, points: Points) -> None:
+    def run(self, points: PointArray) -> None:
         """Segment a scan."""
         self.last = self._segmenter.segment(points)
 
@@ -111,7 +110,7 @@ class KnownScan:
     truth: Labels | None = None  # (N,) true `Label`, if known; UNKNOWN does not count
     semantic: npt.NDArray[np.integer] | None = None  # (N,) classes, if known
     # (N,) true height of the ground [m], with which the surface under true ground is compared
-    ground_z: npt.NDArray[np.floating] | None = None
+    ground_z: PointArray | None = None
     objects: Objects | None = None  # what stands on the ground, if known
     std: str = 'return_std'
     """Field of `Segmentation` that the errors of the height are compared with: heights of ground
@@ -131,7 +130,7 @@ def load_kitti(frame: Frame, cut: float = 0.0) -> KnownScan:
 
 
 def labelled_scan(
-    sequence: str, index: str, points: Points, entries: npt.NDArray[np.uint32], cut: float = 0.0
+    sequence: str, index: str, points: PointArray, entries: Entries, cut: float = 0.0
 ) -> KnownScan:
     """Return a scan whose truth are the entries of a ``.label`` file, (N,); see `load_kitti`."""
     semantic = (entries & 0xFFFF).astype(np.uint16)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.frame import Label
+from gp_ground_seg.core.frame import Label, PointArray
 from gp_ground_seg.data.semantic_kitti import GROUND_CLASSES, OUTLIER, UNLABELLED, VEGETATION
 
 Labels = npt.NDArray[np.uint8]
@@ -93,9 +93,7 @@ def count_labels(label: Labels, truth: Labels) -> dict[str, int]:
     return dict(zip(COUNTS, counts.tolist(), strict=True))
 
 
-def count_rings(
-    label: Labels, truth: Labels, points: npt.NDArray[np.floating]
-) -> list[dict[str, Any]]:
+def count_rings(label: Labels, truth: Labels, points: PointArray) -> list[dict[str, Any]]:
     """Compare by horizontal range of `points` (N, >=2) [m], one row for each ring."""
     x, y = points[:, :2].astype(np.float64).T
     reach = np.hypot(x, y)
@@ -107,9 +105,7 @@ def count_rings(
 
 
 def height_sums(
-    truth: npt.NDArray[np.floating],
-    estimate: npt.NDArray[np.floating],
-    std: npt.NDArray[np.floating] | None = None,
+    truth: PointArray, estimate: PointArray, std: PointArray | None = None
 ) -> dict[str, Any]:
     """Compare true with estimated heights of the ground in a frame, (n,) [m].
 

@@ -14,8 +14,8 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
-from gp_ground_seg.data.semantic_kitti import VEGETATION
+from gp_ground_seg.core.frame import BoolArray, FloatArray, Label, PointArray
+from gp_ground_seg.data.semantic_kitti import VEGETATION, Entries
 from gp_ground_seg.lab.scoring.metrics import Labels
 
 MIN_HEIGHT = 0.3  # height above the local ground from which on a return on an object counts [m]
@@ -61,7 +61,7 @@ class Objects(NamedTuple):
 
     class_of: npt.NDArray[np.integer]  # (N,) index into `CLASSES`; negative: on no object
     object_id: npt.NDArray[np.integer]  # (N,) number of it within its class; 0 = not known
-    ground_z: npt.NDArray[np.floating]  # (N,) local ground [m]; NaN = not known: does not count
+    ground_z: PointArray  # (N,) local ground [m]; NaN = not known: does not count
 
 
 OBJECT_COUNTS = ('n_returns', 'n_ground', 'n_objects', 'n_lost')
@@ -69,9 +69,7 @@ OBJECT_COUNTS = ('n_returns', 'n_ground', 'n_objects', 'n_lost')
 `MIN_RETURNS` of them, and those with more than half of them called ground."""
 
 
-def count_objects(
-    points: npt.NDArray[np.floating], label: Labels, objects: Objects
-) -> list[dict[str, Any]]:
+def count_objects(points: PointArray, label: Labels, objects: Objects) -> list[dict[str, Any]]:
     """Count returns on objects and objects called ground, in a row for each class.
 
     `points` (N, >=3) are x, y, z [m], `label` (N,) what a method says of them; UNKNOWN is not
@@ -104,9 +102,7 @@ def _is_low(class_of: npt.NDArray[np.integer]) -> BoolArray:
     return class_of >= len(CLASSES) - len(LOW_CLASSES)
 
 
-def local_ground(
-    points: npt.NDArray[np.floating], is_ground: BoolArray, wanted: BoolArray
-) -> FloatArray:
+def local_ground(points: PointArray, is_ground: BoolArray, wanted: BoolArray) -> FloatArray:
     """Height of the ground about points (N, >=3), by those that are ground (N,) [m].
 
     The ground is reduced to the median height of its returns in cells of `CELL_SIZE`; about a
@@ -132,9 +128,7 @@ def local_ground(
     return result
 
 
-def labelled_objects(
-    points: npt.NDArray[np.floating], entries: npt.NDArray[np.uint32], is_ground: BoolArray
-) -> Objects:
+def labelled_objects(points: PointArray, entries: Entries, is_ground: BoolArray) -> Objects:
     """Objects by the entries of a ``.label`` file (N,), and the local ground by what is ground.
 
     Instances are numbered by class, so that the whole entry is the number of an object.
@@ -160,7 +154,7 @@ class CutScan(NamedTuple):
 
 
 def cut_objects(
-    points: npt.NDArray[np.floating], is_object: BoolArray, is_ground: BoolArray, height: float
+    points: PointArray, is_object: BoolArray, is_ground: BoolArray, height: float
 ) -> CutScan:
     """Cut objects at a `height` above the ground [m]; what is left is as low as a parcel.
 
@@ -180,10 +174,7 @@ def cut_objects(
 
 
 def count_false_cells(
-    points: npt.NDArray[np.floating],
-    label: Labels,
-    height: npt.NDArray[np.floating],
-    semantic: npt.NDArray[np.integer],
+    points: PointArray, label: Labels, height: PointArray, semantic: npt.NDArray[np.integer]
 ) -> dict[str, int]:
     """Count cells of labelled ground, and those that a costmap takes for an obstacle.
 

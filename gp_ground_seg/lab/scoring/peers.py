@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from gp_ground_seg.core.backend import make_backend
 from gp_ground_seg.core.errors import ConfigError, require
-from gp_ground_seg.core.frame import FloatArray, Frame, Label
+from gp_ground_seg.core.frame import FloatArray, Frame, Label, PointArray
 from gp_ground_seg.core.parameters.config import Config, SensorConfig
 from gp_ground_seg.core.parameters.schema import AUTO
 from gp_ground_seg.lab.scoring import evaluate
@@ -65,7 +65,7 @@ class PatchworkppMethod:
             self._uprightness = float(parameters.uprightness_thr)
             self._estimator = self._module.patchworkpp(parameters)
 
-    def run(self, points: evaluate.Points) -> None:
+    def run(self, points: PointArray) -> None:
         """Segment a scan."""
         if self._origin.any():
             points = points.copy()

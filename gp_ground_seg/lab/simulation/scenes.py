@@ -254,8 +254,7 @@ def _hedge(rng: np.random.Generator) -> Parts:
     for x in np.arange(-40.0, 60.0, 2.0).tolist():
         yield objects.pole(terrain, x, fence, 1.3, 0.05)
         for clearance in (0.52, 0.82, 1.12):
-            rail = objects.floating_box(terrain, x + 1.0, fence, (2.0, 0.04, 0.12), clearance)
-            yield rail
+            yield objects.floating_box(terrain, x + 1.0, fence, (2.0, 0.04, 0.12), clearance)
     yield from traffic.person(terrain, rng.uniform(5.0, 15.0), rng.uniform(-1.0, 1.0))
 
 
