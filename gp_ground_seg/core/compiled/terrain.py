@@ -14,6 +14,7 @@ from gp_ground_seg.core.pipeline.terrain import (
     MIN_SEEDS,
     MIN_WIDTH,
     N_ASIDE,
+    OBLIQUE,
     OWN,
     RAISED,
     REACH,
@@ -204,7 +205,8 @@ def _step_in_front(candidates: Candidates, steep: IntArray, walk: _Walk) -> None
     for aside in range(1, N_ASIDE + 1):
         for k in range(len(steep)):
             beside = (segment[k] + aside) % n_segments
-            _join_front(candidates, steep, k, starts[beside], starts[beside + 1], front)
+            gap = OBLIQUE * aside * arc_of(candidates.r[steep[k] - 1], n_segments)
+            _join_front(candidates, steep, k, gap, starts[beside : beside + 2], front)
     width = np.zeros(len(steep))
     for k in range(len(steep)):
         front[k] = _root(front, k)
@@ -219,18 +221,19 @@ def _step_in_front(candidates: Candidates, steep: IntArray, walk: _Walk) -> None
 
 @jit()
 def _join_front(
-    candidates: Candidates, steep: IntArray, k: int, first: int, stop: int, front: IntArray
+    candidates: Candidates, steep: IntArray, k: int, gap: float, bounds: IntArray, front: IntArray
 ) -> None:
-    """Join step `k` with those of `first` to `stop` that are side by side with it."""
+    """Join step `k` with those within `bounds` that are side by side, to within `gap` [m]."""
     r, z, near, far = candidates.r, candidates.z, steep[k] - 1, steep[k]
-    while first < stop and r[steep[first]] < r[near]:
+    first, stop = bounds
+    while first < stop and r[steep[first]] < r[near] - gap:
         first += 1
-    for other in range(first, min(first + 2, stop)):
-        a, b = steep[other] - 1, steep[other]
+    while first < stop and r[steep[first] - 1] <= r[far] + gap:
+        a, b = steep[first] - 1, steep[first]
         overlaps = min(z[a], z[b]) <= max(z[near], z[far])
-        overlaps &= min(z[near], z[far]) <= max(z[a], z[b])
-        if overlaps and r[a] <= r[far]:
-            _join(front, k, other)
+        if overlaps and min(z[near], z[far]) <= max(z[a], z[b]):
+            _join(front, k, first)
+        first += 1
 
 
 @jit()

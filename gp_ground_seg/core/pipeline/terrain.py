@@ -38,8 +38,9 @@ with the slope before it by any height too: few beams see a hillside in high ste
 LONG_GROWTH, MIN_SLOPE, SAME_SLOPE = 0.4, 0.06, 0.08
 """Growth with range of the longest step along a segment that goes on with the slope of the terrain
 before it [m/m], in such a front too; least slope of one, and difference to that before."""
-N_ASIDE = 2
-"""Segments on each side that a step may lead to."""
+N_ASIDE, OBLIQUE = 2, 2.0
+"""Segments on each side that a step may lead to; how oblique a front may be: difference in range
+of steps side by side, by the distance of their segments."""
 MIN_SEEDS = 8
 """Candidates near the sensor, at the expected height, from which others can be reached."""
 RAISED, MIN_ENTRY, MANY_TIMES = 0.3, 1.5, 3.0
@@ -142,24 +143,25 @@ def _entered(
 def _in_front(candidates: Candidates, near: IntArray) -> BoolArray:
     """Which steep steps, from the candidates `near` (S,) to the next, are in a front, (S,).
 
-    Two steps are side by side if they are in segments at most `N_ASIDE` apart and overlap in range
-    and in height: of a segment, the first that ends no nearer than the other begins, or the one
-    behind it.
+    Two steps are side by side if they are in segments at most `N_ASIDE` apart, and overlap in
+    height and, to within `OBLIQUE` times the distance of the segments, in range.
     """
     n_segments, segment = len(candidates.offsets) - 1, candidates.segment[near]
     r, z = candidates.r, candidates.z
     begin, end = r[near], r[near + 1]
     low, high = np.minimum(z[near], z[near + 1]), np.maximum(z[near], z[near + 1])
-    apart = 2.0 * float(r.max(initial=0.0)) + 1.0
-    key, n, pairs = segment * apart + end, len(near), []
+    apart, n, pairs = 2.0 * float(r.max(initial=0.0)) + 1.0, len(near), []
     for aside in range(1, N_ASIDE + 1):
-        beside = (segment + aside) % n_segments
-        first = np.searchsorted(key, beside * apart + begin)
-        for place in (first, first + 1):
-            other = np.minimum(place, n - 1)
-            is_beside = (place < n) & (segment[other] == beside) & (begin[other] <= end)
-            is_beside &= (low[other] <= high) & (low <= high[other])
-            pairs.append(np.stack([np.arange(n), other])[:, is_beside])
+        beside = (segment + aside) % n_segments * apart
+        gap = OBLIQUE * aside * arc_of(begin, n_segments)
+        nearest, farthest = np.maximum(begin - gap, 0.0), np.minimum(end + gap, 0.5 * apart)
+        first = np.searchsorted(segment * apart + end, beside + nearest)
+        stop = np.searchsorted(segment * apart + begin, beside + farthest, side='right')
+        number = stop - first
+        one = np.repeat(np.arange(n), number)
+        other = np.arange(len(one)) + (stop - np.cumsum(number))[one]
+        overlaps = (low[other] <= high[one]) & (low[one] <= high[other])
+        pairs.append(np.stack([one, other])[:, overlaps])
     front = _groups(n, *np.concatenate(pairs, axis=1))
     width = np.bincount(front, arc_of(begin, n_segments))
     result: BoolArray = (width >= MIN_WIDTH)[front]
@@ -182,7 +184,7 @@ class _Steps(NamedTuple):
     first: IntArray  # (S,) candidates at the near end, and
     second: IntArray  # (S,) at the other one
     length: FloatArray  # (S,) m
-    is_long: BoolArray  # (S,) longer or higher than others, with the slope of the terrain before it
+    is_long: BoolArray  # (S,) longer or higher than others, and as steep as the terrain before it
     is_fall: BoolArray  # (S,) see `falls`
 
 
