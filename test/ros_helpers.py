@@ -35,6 +35,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg.core.backend import choose_backend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
+from gp_ground_seg.data.point_cloud2 import DATATYPES
 from gp_ground_seg.ros import diagnostics
 from gp_ground_seg.ros.input import THROTTLED
 from gp_ground_seg.ros.loader import CHANGED, FOLLOWS
@@ -111,9 +112,7 @@ class Collector:
         return self.messages
 
 
-SETTERS = {
-    SetParameters: 'set_parameters', SetParametersAtomically: 'set_parameters_atomically',
-}  # fmt: skip
+SETTERS = {SetParameters: 'set_parameters', SetParametersAtomically: 'set_parameters_atomically'}
 _LAYOUT = {'names': ['intensity', *'xyz'], 'formats': 4 * ['<f4'], 'offsets': [0, 4, 8, 12]}
 POINT = np.dtype({**_LAYOUT, 'itemsize': 64})
 """A point as a driver sends it: x not first, bytes that belong to no field."""
@@ -141,16 +140,13 @@ def moved(points, xyz):
     return points
 
 
-_CODES = ('i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'f4', 'f8')
-
-
 def to_message(points, stamp=(0, 0), frame=''):
     """Message of structured points."""
     message = PointCloud2(height=1, width=len(points), row_step=points.nbytes)
     message.header.stamp.sec, message.header.stamp.nanosec = stamp
     message.header.frame_id = frame
     message.fields = [
-        PointField(name=name, offset=offset, datatype=1 + _CODES.index(of.str[1:]), count=1)
+        PointField(name=name, offset=offset, datatype=DATATYPES[of.str[1:]], count=1)
         for name, (of, offset) in points.dtype.fields.items()
     ]
     message.point_step = points.dtype.itemsize

@@ -118,8 +118,10 @@ def run_play(arguments: argparse.Namespace) -> int:
         ):
             publishers = {t: session.publisher_of_clouds(t, DEPTH) for t in topics}
             tell_time = session.publisher_of_time() if arguments.clock else lambda _time: None
-            n_subscribed = [publisher.get_subscription_count for publisher in publishers.values()]
-            session.wait_for(lambda: all(n() for n in n_subscribed), DISCOVERY_TIMEOUT)
+            session.wait_for(
+                lambda: all(p.get_subscription_count() for p in publishers.values()),
+                DISCOVERY_TIMEOUT,
+            )
             for topic, due, recorded, raw in _scheduled(
                 bag, topics, arguments.rate, arguments.loop
             ):

@@ -1,8 +1,8 @@
 """``evaluate`` and ``experiment``: measure over labelled or simulated scans, print the tables."""
 
-import argparse
 import inspect
 import math
+from argparse import Namespace
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
@@ -112,7 +112,7 @@ def _add_experiments(subparsers: options.Subparsers) -> None:
         )  # fmt: skip
 
 
-def run_evaluate(arguments: argparse.Namespace) -> int:
+def run_evaluate(arguments: Namespace) -> int:
     """Evaluate, write the files, print the tables."""
     config = options.read_config(arguments)
     cut = CUT_HEIGHT if arguments.cut is None else float(arguments.cut)
@@ -141,7 +141,7 @@ def run_evaluate(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def run_experiment(arguments: argparse.Namespace) -> int:
+def run_experiment(arguments: Namespace) -> int:
     """Measure, write the file, print the tables."""
     name, experiment = arguments.experiment, EXPERIMENTS[arguments.experiment]
     config, is_simulated = options.read_config(arguments), arguments.root is None
@@ -165,7 +165,7 @@ def run_experiment(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def reporting_runner(arguments: argparse.Namespace, title: str) -> AbstractContextManager[Runner]:
+def reporting_runner(arguments: Namespace, title: str) -> AbstractContextManager[Runner]:
     """Return the runner of the options; refuse now what would spoil the report at its end."""
     if arguments.markdown:
         require('tabulate', 'tabulate')
@@ -174,9 +174,7 @@ def reporting_runner(arguments: argparse.Namespace, title: str) -> AbstractConte
     return options.runner(arguments, title)
 
 
-def print_report(
-    arguments: argparse.Namespace, found: report.Report, runner: Runner, **facts: Any
-) -> None:
+def print_report(arguments: Namespace, found: report.Report, runner: Runner, **facts: Any) -> None:
     """Write ``--json`` with `facts`, and print the tables."""
     environment = {**report.describe_environment('pypatchworkpp'), 'n_workers': runner.n_workers}
     if arguments.json:
@@ -186,7 +184,7 @@ def print_report(
     print(found.text(machine, markdown=arguments.markdown))
 
 
-def _items(arguments: argparse.Namespace, cut: float) -> tuple[Any, Callable[[Any], Any]]:
+def _items(arguments: Namespace, cut: float) -> tuple[Any, Callable[[Any], Any]]:
     """Return labelled frames, or with ``--against`` any clouds, and the reader of a cloud."""
     root = Path(arguments.root)
     if semantic_kitti.is_root(root):
@@ -223,7 +221,7 @@ def _result_lines(scores: evaluate.Scores) -> list[str]:
     return [f'{counted}; GroundGrid convention; median time of a frame', *lines]
 
 
-def frames_from_options(arguments: argparse.Namespace) -> list[semantic_kitti.Frame]:
+def frames_from_options(arguments: Namespace) -> list[semantic_kitti.Frame]:
     """Labelled frames of the options, grouped by sequence."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]

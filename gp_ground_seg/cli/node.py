@@ -6,7 +6,6 @@ import time
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core import errors
-from gp_ground_seg.core.errors import GroundSegError, shown
 from gp_ground_seg.core.parameters.config import Config, find_preset, parameter_specs
 from gp_ground_seg.core.parameters.schema import FORM_OF_ROS, is_ours, nodes_of, read_yaml
 from gp_ground_seg.ros.arguments import objections_of_ros
@@ -66,8 +65,8 @@ def main(*, is_managed: bool = False) -> int:
     """Entry point ``ground_segmentation_node``; says what is missing where there is no ROS."""
     try:
         return run_node(sys.argv[1:], is_managed=is_managed)
-    except GroundSegError as error:
-        print(f'ground_segmentation_node: error: {shown(error)}', file=sys.stderr)
+    except errors.GroundSegError as error:
+        print(f'ground_segmentation_node: error: {errors.shown(error)}', file=sys.stderr)
         return 2
 
 
@@ -90,7 +89,7 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
     compile_all()
     seconds, folder = time.monotonic() - begin, code_folder()
     if folder is None:
-        raise GroundSegError('compiled code is not kept on disk, see the note above')
+        raise errors.GroundSegError('compiled code is not kept on disk, see the note above')
     print(f'compiled code is kept in {folder}; it was there after {seconds:.1f} s')
     return 0
 
@@ -111,12 +110,12 @@ def run_check(arguments: argparse.Namespace) -> int:
             problems = objections_of_ros(path)
         for problem in problems:
             code = 2
-            print(shown(f'{path}: {problem}'), file=sys.stderr)
+            print(errors.shown(f'{path}: {problem}'), file=sys.stderr)
         for node, values in [] if problems else nodes:
             n_changed = len(Config().differences(Config().replace(**values)))
             given = f'{len(values)} of {len(parameter_specs())} parameters given'
             use = '' if node else f' for --config, but not in the form of ROS that {FORM_OF_ROS}'
             if '/' in node.strip('/') or not is_ours(node):
-                use = f' for a node named {shown(node)} only'
-            print(f'{shown(path)}: good{use}; {given}, {n_changed} unlike the default')
+                use = f' for a node named {errors.shown(node)} only'
+            print(f'{errors.shown(path)}: good{use}; {given}, {n_changed} unlike the default')
     return code

@@ -20,7 +20,6 @@ import numpy.typing as npt
 from gp_ground_seg.core.errors import DataError, PointCloudError
 from gp_ground_seg.core.pipeline.points import finite_points, hint_of_table, objection_to_ranges
 from gp_ground_seg.data import clouds
-from gp_ground_seg.data.clouds import Cloud, Columns, Fields
 from gp_ground_seg.data.files import MAX_SCAN_BYTES, naming, read_bytes
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
@@ -49,7 +48,7 @@ TABLE = 'points'  # array of an .npz that is a table (N, >= 3), beside fields (N
 _BESIDE = re.compile('colo|rgb|normal|label|feat|flow|pose|transf|calib|face|box', re.IGNORECASE)
 
 
-def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
+def _read_numpy(data: bytes) -> tuple[clouds.Fields, clouds.Columns]:
     """Read a table x, y, z, intensity, ..., a structured array, or arrays by name.
 
     Arrays of another length than that of the points are what the file has beside them.
@@ -57,7 +56,7 @@ def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
     if not data.startswith((b'\x93NUMPY', b'PK')):
         raise PointCloudError(f'is no file of numpy; it begins with {data[:20]!r}')
     found = np.load(io.BytesIO(data), allow_pickle=False)
-    arrays: Columns = {TABLE: found} if isinstance(found, np.ndarray) else dict(found)
+    arrays: clouds.Columns = {TABLE: found} if isinstance(found, np.ndarray) else dict(found)
     if clouds.coordinate_names(arrays)[0] not in arrays:
         table = arrays.pop(_table_of(arrays))
         arrays = {**clouds.scatter(_points_of(table)), **arrays}
@@ -66,7 +65,7 @@ def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
     return clouds.gather(fields), {name: v for name, v in arrays.items() if name not in fields}
 
 
-def _table_of(arrays: Columns) -> str:
+def _table_of(arrays: clouds.Columns) -> str:
     """Name of the table of coordinates: of most rows, and not called as something else."""
     if TABLE in arrays:
         return TABLE
@@ -84,7 +83,7 @@ def _table_of(arrays: Columns) -> str:
     return most[0]
 
 
-def _points_of(table: npt.NDArray[Any]) -> Fields:
+def _points_of(table: npt.NDArray[Any]) -> clouds.Fields:
     """Structured array of a table, or of one that is structured."""
     if table.dtype.names:
         return table.ravel()
@@ -97,7 +96,7 @@ def _points_of(table: npt.NDArray[Any]) -> Fields:
     return clouds.name_columns(table)
 
 
-def _encode_npy(cloud: Cloud) -> bytes:
+def _encode_npy(cloud: clouds.Cloud) -> bytes:
     """File of a structured array."""
     file = io.BytesIO()
     # Of numpy 1.17: names may be beyond ASCII.
@@ -105,7 +104,7 @@ def _encode_npy(cloud: Cloud) -> bytes:
     return file.getvalue()
 
 
-def _encode_npz(cloud: Cloud) -> bytes:
+def _encode_npz(cloud: clouds.Cloud) -> bytes:
     """File of an array for each field, and of arrays of another length."""
     file = io.BytesIO()
     others = cloud.header if isinstance(cloud.header, dict) else {}
@@ -115,7 +114,7 @@ def _encode_npz(cloud: Cloud) -> bytes:
 
 
 # Each returns the points, and what the file has beside them.
-_READERS: dict[str, Callable[[bytes], tuple[Fields, Any]]] = {
+_READERS: dict[str, Callable[[bytes], tuple[clouds.Fields, Any]]] = {
     '.pcd': read_pcd,
     '.ply': read_ply,
     '.npy': _read_numpy,
@@ -130,7 +129,7 @@ SEMANTIC_KITTI_CODE = np.array([0, 40, 99], '<u4')  # by `Label`: unlabelled, ro
 _VALUES = ('height', 'ground_z', 'ground_std', 'p_ground')
 
 
-def read_file(path: Path, columns: int = KITTI_COLUMNS) -> Cloud:
+def read_file(path: Path, columns: int = KITTI_COLUMNS) -> clouds.Cloud:
     """Read a file; `columns` are the numbers of a point in a ``.bin``.
 
     Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
@@ -148,7 +147,7 @@ def read_file(path: Path, columns: int = KITTI_COLUMNS) -> Cloud:
     return cloud
 
 
-def decode_file(path: Path, data: bytes) -> Cloud:
+def decode_file(path: Path, data: bytes) -> clouds.Cloud:
     """Cloud of the data of a file, of the format of `path`; DataError if it cannot be read."""
     with naming(path, f'cannot be read as {path.suffix}; is it whole?'), np.errstate(all='ignore'):
         fields, header = _READERS[path.suffix.lower()](data)
@@ -156,7 +155,7 @@ def decode_file(path: Path, data: bytes) -> Cloud:
         return clouds.cloud_of(fields, header)
 
 
-def encode_file(path: Path, cloud: Cloud, columns: Columns) -> bytes:
+def encode_file(path: Path, cloud: clouds.Cloud, columns: clouds.Columns) -> bytes:
     """File of a cloud with further values for each point; DataError if none can be.
 
     Its format is that of `path`, one of `WRITABLE`.
@@ -165,7 +164,7 @@ def encode_file(path: Path, cloud: Cloud, columns: Columns) -> bytes:
         return _ENCODERS[path.suffix](cloud.join(columns))
 
 
-def encode_output(path: Path, cloud: Cloud, result: Segmentation) -> bytes:
+def encode_output(path: Path, cloud: clouds.Cloud, result: Segmentation) -> bytes:
     """File of a cloud with its labels, of the format of `path`; DataError if none can be.
 
     A ``.label`` has a uint32 for each point, SemanticKITTI's code. Other files have every field of
@@ -177,7 +176,7 @@ def encode_output(path: Path, cloud: Cloud, result: Segmentation) -> bytes:
     return encode_file(path, cloud, {'label': result.label, **values})
 
 
-def _read_bin(path: Path, data: bytes, columns: int) -> Cloud:
+def _read_bin(path: Path, data: bytes, columns: int) -> clouds.Cloud:
     """Cloud of float32, x, y, z [m] first in each point; a missing intensity is zero."""
     if len(data) % (4 * columns):
         raise DataError(
@@ -193,7 +192,7 @@ def _read_bin(path: Path, data: bytes, columns: int) -> Cloud:
     table = numbers.reshape(-1, columns)
     points = np.zeros((len(table), 4), dtype=np.float32)
     points[:, :columns] = table[:, :4]
-    return Cloud(clouds.name_columns(table), points)
+    return clouds.Cloud(clouds.name_columns(table), points)
 
 
 def find_columns(numbers: npt.NDArray[np.float32], columns: int) -> int:

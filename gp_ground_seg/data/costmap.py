@@ -13,15 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gp_ground_seg.core import frame
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.frame import (
-    NOT_FINITE,
-    BoolArray,
-    FloatArray,
-    GroundSurface,
-    Label,
-    PointArray,
-)
+from gp_ground_seg.core.frame import NOT_FINITE, BoolArray, FloatArray, Label, PointArray
 from gp_ground_seg.core.ground_model import segment_of
 from gp_ground_seg.core.parameters.config import ANY_HEIGHT, Config
 from gp_ground_seg.core.pipeline.sensor_pose import LEAST_COSINE
@@ -200,7 +194,7 @@ def scan_ranges(obstacles: Places | Blocked, returns: Places) -> Ranges:
     return ranges
 
 
-def reach_of_model(surface: GroundSurface, heading: FloatArray, tolerance: float) -> Ranges:
+def reach_of_model(surface: frame.GroundSurface, heading: FloatArray, tolerance: float) -> Ranges:
     """Range up to which the ground is known to within `tolerance` [m], (DIRECTIONS,) [m].
 
     `heading` (2, 2) turns directions of the map into those of the level frame of `surface`.

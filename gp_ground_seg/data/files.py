@@ -20,6 +20,7 @@ from gp_ground_seg.core import errors
 from gp_ground_seg.core.errors import DataError, PointCloudError
 
 MAX_SCAN_BYTES = 1 << 30  # of a file: 67 million points, a hundred times a dense scan
+IsKind = Callable[[Path], bool]  # whether a path is of the kind that may be replaced
 PARTIAL_MARK = '.partial-'  # part of the names of hidden folders with unfinished output
 _REPLACED = 'replaced'  # name that a bag has there until the one that replaces it is in its place
 
@@ -128,11 +129,7 @@ def write_file(path: Path, data: bytes, *, force: bool = True) -> None:
 
 @contextmanager
 def staged_file(
-    target: str | Path,
-    *,
-    force: bool,
-    is_kind: Callable[[Path], bool] = Path.is_file,
-    tidies: bool = True,
+    target: str | Path, *, force: bool, is_kind: IsKind = Path.is_file, tidies: bool = True
 ) -> Iterator[Path]:
     """Yield a path to write; at the end of the block the file is renamed to `target`.
 
@@ -169,7 +166,7 @@ def staged_file(
         raise DataError(f'{target}: cannot be written: {errors.reason_of(error)}') from error
 
 
-def _check(target: str | Path, force: bool, is_kind: Callable[[Path], bool], path: Path) -> None:
+def _check(target: str | Path, force: bool, is_kind: IsKind, path: Path) -> None:
     """Raise DataError if what is there may not be replaced."""
     if path.exists() and not is_kind(path):
         kind = 'file' if is_kind is Path.is_file else 'rosbag2 folder'

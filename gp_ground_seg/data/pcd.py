@@ -15,7 +15,6 @@ import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError, require
 from gp_ground_seg.data import clouds
-from gp_ground_seg.data.clouds import Cloud, Fields
 
 _MAX_EXPANSION = 88  # of LZF: three bytes repeat 264 at most
 _MAX_NUMBER = 1 << 32  # in a header
@@ -32,7 +31,7 @@ class PcdHeader(NamedTuple):
     viewpoint: str = '0 0 0 1 0 0 0'
 
 
-def read_pcd(data: bytes) -> tuple[Fields, PcdHeader]:
+def read_pcd(data: bytes) -> tuple[clouds.Fields, PcdHeader]:
     """Read a file; PointCloudError if it cannot be one.
 
     Keys are read in capitals or not, COLUMNS as FIELDS, and what is not given is as PCL takes it:
@@ -102,7 +101,7 @@ def _types_of(names: list[str], entries: dict[str, list[str]]) -> list[tuple[str
     return types
 
 
-def _read_compressed(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
+def _read_compressed(data: bytes, dtype: np.dtype[Any], n_points: int) -> clouds.Fields:
     """Read a body: its size, that unpacked, and field after field without padding."""
     packed, size = struct.unpack('<II', data[:8].ljust(8, b'\0'))
     needed = n_points * dtype.itemsize
@@ -122,7 +121,7 @@ def _read_compressed(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields
     return fields
 
 
-def encode_pcd(cloud: Cloud) -> bytes:
+def encode_pcd(cloud: clouds.Cloud) -> bytes:
     """Binary file of a cloud, organised and with the viewpoint as it was read."""
     fields = clouds.in_types(cloud.fields, _TYPES, 'PCD')
     header = cloud.header if isinstance(cloud.header, PcdHeader) else PcdHeader()

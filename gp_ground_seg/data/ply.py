@@ -14,7 +14,6 @@ import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError, log_once
 from gp_ground_seg.data import clouds
-from gp_ground_seg.data.clouds import Cloud, Fields
 
 _CODES = {
     'char': 'i1', 'uchar': 'u1', 'short': 'i2', 'ushort': 'u2', 'int': 'i4', 'uint': 'u4',
@@ -30,7 +29,7 @@ _ORDERS: dict[str, _Order] = {
 _Lists = list[tuple[int, int]]  # bytes of the count, and of an item, of each list of a vertex
 
 
-def read_ply(data: bytes) -> tuple[Fields, list[str]]:
+def read_ply(data: bytes) -> tuple[clouds.Fields, list[str]]:
     """Read the vertices of a file, without lists behind their numbers, and its comments.
 
     PointCloudError if it cannot be a PLY, or if the vertices are not its first element.
@@ -90,7 +89,7 @@ def _without_lists(
     return b''.join(rows)
 
 
-def encode_ply(cloud: Cloud) -> bytes:
+def encode_ply(cloud: clouds.Cloud) -> bytes:
     """File of a cloud as vertices, binary, with the comments it was read with."""
     fields = clouds.in_types(cloud.fields, _NAMES, 'PLY', flat=True)
     lines = [

@@ -21,7 +21,7 @@ from numpy.lib.stride_tricks import as_strided
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import PointArray
 from gp_ground_seg.core.pipeline.points import finite_points, single_precision
-from gp_ground_seg.data.clouds import distinct
+from gp_ground_seg.data.clouds import Columns, distinct
 
 _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 _DATATYPE_NAMES = {datatype: np.dtype(code).name.upper() for datatype, code in _CODES.items()}
@@ -81,7 +81,7 @@ def read_xyz(cloud: CloudMessage, *, is_single: bool = False) -> PointArray:
     return single_precision(xyz) if is_single else xyz
 
 
-def read_columns(cloud: CloudMessage, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
+def read_columns(cloud: CloudMessage, names: Sequence[str]) -> Columns:
     """Values of the fields `names`, each (height, width), a copy in native byte order."""
     views = _views(cloud, names, _CODES).items()
     return {name: view.astype(view.dtype.newbyteorder('=')) for name, view in views}
@@ -144,9 +144,7 @@ def _code(cloud: CloudMessage, datatype: int) -> str:
     return f'{">" if cloud.is_bigendian else "<"}{_CODES[datatype]}'
 
 
-def _views(
-    cloud: CloudMessage, names: Sequence[str], accepted: Collection[int]
-) -> dict[str, npt.NDArray[Any]]:
+def _views(cloud: CloudMessage, names: Sequence[str], accepted: Collection[int]) -> Columns:
     """Fields `names` where they lie in the data, each (height, width), checked."""
     views = {}
     _view(cloud, 'u1')  # the layout before the fields

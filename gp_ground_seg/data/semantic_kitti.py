@@ -19,8 +19,7 @@ GROUND_CLASSES = (40, 44, 48, 49, 60, 72)
 """Road, parking, sidewalk, other ground, lane marking, terrain."""
 FRAME_PERIOD = 0.1  # time between frames [s] where a sequence has no times.txt
 _MAX_TIMES_BYTES = 1 << 24
-Entries = npt.NDArray[np.uint32]
-"""Of a ``.label`` file, (N,): class below, instance in the upper 16 bits."""
+Entries = npt.NDArray[np.uint32]  # of a ``.label`` file, (N,)
 
 
 @dataclass(frozen=True)
@@ -150,7 +149,7 @@ def _read_times(path: Path, frames: Sequence[Path]) -> list[float]:
 
 
 def read_entries(path: str | Path, n_points: int) -> Entries:
-    """Entries of a ``.label`` file, (n_points,).
+    """Entries of a ``.label`` file, (n_points,): class below, instance in the upper 16 bits.
 
     DataError if it cannot be read, or has another number.
     """

@@ -283,9 +283,7 @@ COUNTED = {'vehicles': ('vehicle',), 'persons': ('person', 'cyclist')}
 """Columns of objects, and their `CLASSES`."""
 
 
-def score_scenes(
-    frames: Sequence[SimulatedFrame], config: Config, runner: Runner = HERE
-) -> Report:
+def score_scenes(items: Sequence[SimulatedFrame], config: Config, runner: Runner = HERE) -> Report:
     """Score simulated scans by exact labels and heights, and count objects lost, low ones too.
 
     An object is lost if more than half of its returns from 0.3 m above the ground are called
@@ -294,7 +292,7 @@ def score_scenes(
     parameters. Low objects, and rough and steep ground, have tables of their own.
     """
     methods: list[Method] = [OurMethod(config), PatchworkppMethod()]
-    scores = evaluate.score_methods(frames, methods, load_scan, each_alone=True, runner=runner)
+    scores = evaluate.score_methods(items, methods, load_scan, each_alone=True, runner=runner)
     parts = {'scenes': _scene_table(scores)}
     for name, make, scenes in (('low', _low_table, LOW), ('rough', _rough_table, ROUGH)):
         if own := [pair for pair in scores.sequences if pair.split()[1] in scenes]:

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from gp_ground_seg.core import errors
 from gp_ground_seg.core.errors import DataError, require
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
+from gp_ground_seg.core.parameters.config import Config, parameter_specs
 from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
@@ -218,7 +218,7 @@ class Tuner:
         self._frame = gui.add_slider('frame', 0, max(last, 1), 1, frame, visible=last > 0)
         self._colours = gui.add_dropdown('colours', ('changes', 'class', 'errors'))
         self._watch(self._frame, self._colours)
-        self._controls = {name: self._add_control(find_spec(name)) for name in names}
+        self._controls = {name: self._add_control(Config.find_spec(name)) for name in names}
         self.add_button('compare with these values', self._compare)
 
     @property

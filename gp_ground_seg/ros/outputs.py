@@ -16,7 +16,6 @@ from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 from gp_ground_seg.core.frame import NOT_FINITE, BoolArray
 from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.data import costmap, point_cloud2
-from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import message_bytes, message_data, read_xyz, select_points
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
@@ -38,12 +37,12 @@ class Output(NamedTuple):
 
     topic: str
     message_type: type
-    build: Callable[[SegmentedCloud], Any]
+    build: Callable[[costmap.SegmentedCloud], Any]
     is_optional: bool  # built only while it has a subscriber
     profile: QoSProfile = QoSProfile(depth=OUTPUT_DEPTH)
 
 
-def labelled_cloud(segmented: SegmentedCloud) -> PointCloud2:
+def labelled_cloud(segmented: costmap.SegmentedCloud) -> PointCloud2:
     """Return the cloud with `LABELLED_FIELDS` added to every point, with ``gp_`` if in use.
 
     Header, order, shape and every byte of every point are the input's; padding of the rows is
@@ -70,7 +69,7 @@ def labelled_cloud(segmented: SegmentedCloud) -> PointCloud2:
     return message
 
 
-def ground_model_cloud(segmented: SegmentedCloud) -> PointCloud2:
+def ground_model_cloud(segmented: costmap.SegmentedCloud) -> PointCloud2:
     """Return the surface of a segmented cloud as an organised cloud with its header.
 
     Row m is segment m, counter-clockwise from -x of the level frame; column k is the k-th
@@ -79,13 +78,10 @@ def ground_model_cloud(segmented: SegmentedCloud) -> PointCloud2:
     """
     model = GroundModel.of(segmented.segmentation)
     n_segments, n_knots = model.height.shape
-    points = np.empty((n_segments, n_knots, len(MODEL_FIELDS)), dtype='<f4')
+    places, pose = np.moveaxis(model.knot_points(), -1, 0), (model.roll, model.pitch)
+    columns = *places, model.std, model.length_scale, model.knots, *pose, *model.origin
     with np.errstate(over='ignore'):
-        points[..., :3] = model.knot_points()
-        points[..., 3] = model.std
-        points[..., 4] = model.length_scale
-        points[..., 5] = model.knots
-        points[..., 6:] = model.roll, model.pitch, *model.origin
+        points = np.stack(np.broadcast_arrays(*columns), axis=-1).astype('<f4')
     message = PointCloud2(
         header=segmented.cloud.header,
         height=n_segments,
@@ -112,7 +108,7 @@ def read_ground_model(cloud: PointCloud2) -> GroundModel:
     return GroundModel.from_columns(point_cloud2.read_columns(cloud, MODEL_FIELDS))
 
 
-def scan(segmented: SegmentedCloud) -> LaserScan:
+def scan(segmented: costmap.SegmentedCloud) -> LaserScan:
     """Return the nearest obstacle in each direction about the origin of the cloud.
 
     Infinite where the direction has returns and no obstacle, NaN where it has no return. Edges of
@@ -127,7 +123,7 @@ def scan(segmented: SegmentedCloud) -> LaserScan:
     return message
 
 
-def occupancy_grid(segmented: SegmentedCloud) -> OccupancyGrid:
+def occupancy_grid(segmented: costmap.SegmentedCloud) -> OccupancyGrid:
     """Return the cells about the origin of the cloud: free, occupied or unknown."""
     output, ground_std = segmented.config.output, segmented.config.label.ground_tolerance
     ground, obstacles = segmented.places(segmented.is_ground), segmented.blocked
@@ -143,7 +139,7 @@ def occupancy_grid(segmented: SegmentedCloud) -> OccupancyGrid:
     return message
 
 
-def _selected(segmented: SegmentedCloud, chosen: BoolArray) -> PointCloud2:
+def _selected(segmented: costmap.SegmentedCloud, chosen: BoolArray) -> PointCloud2:
     """Return the `chosen` points, (N,) bool, which are finite, with every byte of each."""
     return select_points(segmented.cloud, chosen, message_bytes, are_finite=True)
 
@@ -181,7 +177,7 @@ class OutputPublishers:
         """Return the number of subscribers of each topic."""
         return {p.topic_name: p.get_subscription_count() for _, p in self._publishers}
 
-    def publish(self, segmented: SegmentedCloud) -> None:
+    def publish(self, segmented: costmap.SegmentedCloud) -> None:
         """Publish all outputs of a cloud, or none if one cannot be built."""
         seconds = 1e-9 * point_cloud2.stamp_of(segmented.cloud.header)
         period, self._stamp = seconds - self._stamp, seconds

@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 
 from gp_ground_seg.core.errors import ConfigError, GroundSegError
-from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
+from gp_ground_seg.core.parameters.config import Config, parameter_specs
 from gp_ground_seg.core.parameters.schema import EMPTY_LIST, OF_EVERY_NODE, ParameterSpec
 from gp_ground_seg.ros.arguments import start_errors
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
@@ -163,7 +163,7 @@ class ConfiguredNode(Node):  # type: ignore[misc]
 
 def _typed(parameter: Parameter) -> Parameter:
     """Return an integer given for a number as a number: YAML and ``ros2 param set`` read 2 so."""
-    is_number = parameter.name in _NAMES and find_spec(parameter.name).type is float
+    is_number = parameter.name in _NAMES and Config.find_spec(parameter.name).type is float
     if is_number and parameter.type_ == Parameter.Type.INTEGER:
         return Parameter(parameter.name, value=float(parameter.value))
     return parameter
@@ -171,7 +171,7 @@ def _typed(parameter: Parameter) -> Parameter:
 
 def _unknown(name: str) -> str:
     try:
-        find_spec(name)
+        Config.find_spec(name)
     except ConfigError as error:
         return str(error)
     return f'{name} is not declared'

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter
 from gp_ground_seg.cli.options import parse_setting
-from gp_ground_seg.core.parameters.config import config_of, find_spec, parameter_specs
+from gp_ground_seg.core.parameters.config import config_of, parameter_specs
 from gp_ground_seg.core.parameters.schema import flatten, numbers_of
 
 SPECS = parameter_specs()
@@ -72,7 +72,7 @@ BOX = -1.0, 0.5, -0.4, 0.4, -0.5, 1.0
 
 
 def test_a_box_is_six_numbers_or_none():
-    spec = find_spec('input.crop_box')
+    spec = Config.find_spec('input.crop_box')
     mixed = '[-1, 0.5, -0.4, 0.4, -0.5, 1]'  # as ros2 param set sends it
     for value in (BOX, list(BOX), np.array(BOX), array('d', BOX), mixed):
         assert spec.check(value) == BOX
@@ -120,7 +120,7 @@ def test_what_is_refused_and_what_is_said(changes, said):
     with pytest.raises(ConfigError, match=said):
         Config().replace(**changes)
     for good in ('base_link', 'robot_1/base.link-2', '7'):
-        assert find_spec(WORD).check(good) == good
+        assert Config.find_spec(WORD).check(good) == good
 
 
 NESTED = {'sensor': {'height': 1.5}, 'grid': {'n_bins': 90, 'r_max': 40}}
@@ -171,7 +171,7 @@ def test_forms_agree_and_no_change_but_in_a_copy(config, other):
     for name, value in flat.items():
         group, field = name.split('.')
         assert config[name] == nested[group][field] == value
-        assert is_of_declared_type(find_spec(name), value)
+        assert is_of_declared_type(Config.find_spec(name), value)
     assert pickle.loads(pickle.dumps(config)) == copy.deepcopy(config) == config
     assert hash(config) == hash(config.replace())
 

@@ -21,7 +21,6 @@ from test_sensor_pose import (
 
 from gp_ground_seg import Config
 from gp_ground_seg.core.ground_model import GroundModel
-from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.core.pipeline import sensor_pose
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.ground_view import LOWER_ENDS, UPRIGHT, View
@@ -60,7 +59,7 @@ def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicl
         assert sensor_pose.for_sensor(paper, pose) is paper
         # What is at its least already is not refused.
         names = (*GATES, 'label.ground_tolerance', 'grid.r_min')
-        tiny = config.replace(**{name: find_spec(name).minimum for name in names})
+        tiny = config.replace(**{name: Config.find_spec(name).minimum for name in names})
         assert sensor_pose.for_sensor(tiny, pose) == tiny
     # The sensor is where the origin is given to be.
     points = moved(scan_of('kerb', SMALL_VLP, 0.15).points, 0.15)

@@ -16,7 +16,7 @@ from ros_helpers import bench, street, to_message
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.jit import HAVE_NUMBA
-from gp_ground_seg.core.parameters.config import find_spec, parameter_specs
+from gp_ground_seg.core.parameters.config import parameter_specs
 from gp_ground_seg.core.parameters.schema import flatten
 from gp_ground_seg.ros.loader import CHANGED
 
@@ -139,7 +139,7 @@ def test_a_number_or_auto_is_taken(b, name):
         assert values_of(b, [name]) == {name: value} == {name: b.node.config[name]}
         (found,) = described(b, [name])
         assert found.type == TYPES[type(value)]
-        assert found.floating_point_range[0].to_value == find_spec(name).maximum
+        assert found.floating_point_range[0].to_value == Config.find_spec(name).maximum
 
 
 def test_several_at_once_are_all_taken_or_none(b):

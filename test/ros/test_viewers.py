@@ -10,7 +10,6 @@ from conftest import ROAD, simulated
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.lab import tuner as page
 from gp_ground_seg.lab.scoring.evaluate import MethodResult, score_scan
@@ -65,11 +64,11 @@ def test_a_slider_goes_through_accepted_values_and_holds_the_one_at_hand():
         assert [spec.check(value) for value in (low, high)] == [low, high]
         assert 0 < step < high - low
         assert spec.default == 'auto' or low <= spec.default <= high
-    spec = find_spec('label.ground_tolerance')
+    spec = Config.find_spec('label.ground_tolerance')
     low, high, step = page.slider_range(spec, 0.1234)
     assert (low, high, step) == pytest.approx((0.02, 0.5, 1e-4))
     assert page.slider_range(spec, 3.0)[1] == 3.0
-    assert page.slider_range(find_spec('sensor.roll'), 'auto')[:2] == (-0.3, 0.3)
+    assert page.slider_range(Config.find_spec('sensor.roll'), 'auto')[:2] == (-0.3, 0.3)
 
 
 @pytest.fixture

@@ -14,19 +14,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gp_ground_seg.core.errors import ConfigError
-from gp_ground_seg.core.parameters.schema import (
-    AUTO,
-    NO_BOX,
-    YAML_SUFFIXES,
-    ParameterGroup,
-    ParameterGroups,
-    ParameterSpec,
-    ParameterValue,
-    advanced,
-    basic,
-    did_you_mean,
-    parameters_of,
-)
+from gp_ground_seg.core.parameters import schema
+from gp_ground_seg.core.parameters.schema import ParameterGroup, ParameterGroups, advanced, basic
 
 NO_FRAME = 'none'
 SENSOR_HEIGHTS = -5.0, 20.0
@@ -43,13 +32,13 @@ ANY_HEIGHT = 100.0
 class SensorConfig(ParameterGroup):
     """Pose of the sensor; auto = estimated from every scan (docs/pose.md)."""
 
-    height: float | Literal['auto'] = basic(AUTO, SENSOR_HEIGHTS,
+    height: float | Literal['auto'] = basic(schema.AUTO, SENSOR_HEIGHTS,
         "height of the cloud's origin above the ground; 0 = that of a vehicle frame on the ground",
         'm')
-    roll: float | Literal['auto'] = basic(AUTO, (-3.15, 3.15),
+    roll: float | Literal['auto'] = basic(schema.AUTO, (-3.15, 3.15),
         'roll of the sensor, positive with its left side up; auto = none unless it is clear',
         'rad')
-    pitch: float | Literal['auto'] = basic(AUTO, (-1.58, 1.58),
+    pitch: float | Literal['auto'] = basic(schema.AUTO, (-1.58, 1.58),
         'pitch of the sensor, positive with its nose down; auto = none unless it is clear', 'rad')
     origin_x: float = advanced(0.0, (-50.0, 50.0),
         "sensor position in the cloud's frame, x; needed if clouds are in a vehicle frame", 'm')
@@ -74,7 +63,7 @@ class FrameConfig(ParameterGroup):
 class InputConfig(ParameterGroup):
     """What is taken of the input."""
 
-    crop_box: tuple[float, ...] | Literal['none'] = basic(NO_BOX, (-100.0, 100.0),
+    crop_box: tuple[float, ...] | Literal['none'] = basic(schema.NO_BOX, (-100.0, 100.0),
         "box about the robot's own body, whose points are no returns: x min, x max, y min, y max, "
         'z min, z max in the frame of the cloud, or of frame.base with frame.level = tf', 'm')
     lazy: bool = advanced(False, (),
@@ -353,12 +342,9 @@ class Config(ParameterGroups):
         return find_preset(name).config
 
 
-def parameter_specs() -> tuple[ParameterSpec, ...]:
+def parameter_specs() -> tuple[schema.ParameterSpec, ...]:
     """Return every declared parameter, in order of declaration."""
     return tuple(Config.specs().values())
-
-
-find_spec = Config.find_spec
 
 
 @dataclass(frozen=True)
@@ -367,7 +353,7 @@ class Preset:
 
     name: str
     purpose: str
-    overrides: dict[str, tuple[ParameterValue, str]] = field(default_factory=dict)
+    overrides: dict[str, tuple[schema.ParameterValue, str]] = field(default_factory=dict)
     """Values that differ from the defaults, each with the reason, by name."""
 
     @property
@@ -430,7 +416,7 @@ PRESETS = {preset.name: preset for preset in _PRESETS}
 def find_preset(name: str) -> Preset:
     """Return the preset `name`; raises ConfigError with the nearest one and all others."""
     if name not in PRESETS:
-        hint = did_you_mean(name, PRESETS)
+        hint = schema.did_you_mean(name, PRESETS)
         raise ConfigError(f'unknown preset {name!r}{hint} (there are {", ".join(PRESETS)})')
     return PRESETS[name]
 
@@ -454,12 +440,14 @@ def config_of(given: Config | str | Path | Mapping[str, Any] | None, **values: A
     if isinstance(given, Config):
         config = given
     elif given is None or isinstance(given, Mapping):
-        config = Config().replace(**parameters_of(given))
-    elif isinstance(given, Path) or str(given).endswith(YAML_SUFFIXES):
+        config = Config().replace(**schema.parameters_of(given))
+    elif isinstance(given, Path) or str(given).endswith(schema.YAML_SUFFIXES):
         config = Config.from_yaml(given)
     else:
         config = find_preset(str(given)).config
     names = {spec.name.replace('.', '_'): spec.name for spec in parameter_specs()}
     if unknown := [name for name in values if name not in names]:
-        raise ConfigError(f'unknown parameter {unknown[0]}{did_you_mean(unknown[0], names)}')
+        raise ConfigError(
+            f'unknown parameter {unknown[0]}{schema.did_you_mean(unknown[0], names)}'
+        )
     return config.replace(**{names[name]: value for name, value in values.items()})

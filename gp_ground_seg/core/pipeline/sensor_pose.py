@@ -9,7 +9,7 @@ import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import FloatArray, PointArray, usual_errors
-from gp_ground_seg.core.parameters.config import Config, SensorConfig, find_spec
+from gp_ground_seg.core.parameters.config import Config, SensorConfig
 from gp_ground_seg.core.parameters.schema import AUTO
 from gp_ground_seg.core.pipeline.ground_plane import CLEAR_TILT, GroundPlane
 from gp_ground_seg.core.pipeline.ground_view import LOW, View, refusal
@@ -271,7 +271,7 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
         'label.obstacle_min_height',
         'observation.slope_drift',
     )
-    least = {name: float(find_spec(name).minimum or 0.0) for name in names}
+    least = {name: float(Config.find_spec(name).minimum or 0.0) for name in names}
     least['label.ground_tolerance'] = min(LEAST_TOLERANCE, config.label.ground_tolerance)
     return config.replace(**{name: max(share * config[name], least[name]) for name in names})
 

@@ -25,7 +25,6 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import VEGETATION, Entries, Frame
 from gp_ground_seg.lab.cluster import HERE, Progress, Runner
 from gp_ground_seg.lab.scoring import metrics, objects
-from gp_ground_seg.lab.scoring.metrics import COUNTS, Labels
 from gp_ground_seg.lab.scoring.objects import OBJECT_COUNTS, CutScan, Objects
 from gp_ground_seg.lab.scoring.report import DataFrame, frame_of, require_pandas
 
@@ -44,7 +43,7 @@ KEYS = ('method', 'sequence', 'index')
 """Columns of every frame. Method and sequence are in the order of the methods and the scans."""
 COLUMNS: dict[str, tuple[str, ...]] = {
     'scans': KEYS,
-    'rings': (*KEYS, 'range', *COUNTS),
+    'rings': (*KEYS, 'range', *metrics.COUNTS),
     'objects': (*KEYS, 'class', *OBJECT_COUNTS),
 }
 """Columns that each frame has, even without rows."""
@@ -60,7 +59,7 @@ class MethodResult:
     Its names, and more of them, are those of our `Segmentation`.
     """
 
-    label: Labels  # (N,)
+    label: metrics.Labels  # (N,)
     ground_z: FloatArray  # (N,) height of the ground under each point [m]; NaN = no model
 
 
@@ -107,7 +106,7 @@ class KnownScan:
     sequence: str  # or another group of scans that belong together
     index: str  # name within it
     points: npt.NDArray[Any]  # (N, >=3) x, y, z [m], and intensity
-    truth: Labels | None = None  # (N,) true `Label`, if known; UNKNOWN does not count
+    truth: metrics.Labels | None = None  # (N,) true `Label`, if known; UNKNOWN does not count
     semantic: npt.NDArray[np.integer] | None = None  # (N,) classes, if known
     # (N,) true height of the ground [m], with which the surface under true ground is compared
     ground_z: PointArray | None = None

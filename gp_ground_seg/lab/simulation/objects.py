@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.frame import FloatArray, IntArray
-from gp_ground_seg.lab.simulation.terrain import Terrain
+from gp_ground_seg.lab.simulation.terrain import Place, Terrain
 
 KindArray: TypeAlias = npt.NDArray[np.uint8]
 Interval: TypeAlias = tuple[FloatArray, FloatArray]
@@ -20,7 +20,7 @@ Size: TypeAlias = tuple[float, float, float]  # length, width, height [m]
 BURIED_DEPTH = 3.0  # of standing solids below the ground at their centre: none hovers [m]
 WALL_PANEL, WALL_THICKNESS = 4.0, 0.3
 """Longest panel of a wall, whose panels follow the ground, and thickness of all [m]."""
-SMALLEST_RATE = 1e-12  # for a zero component of a unit vector; keeps 0 / 0 out of the slab tests
+SMALLEST_RATE = 1e-12  # for a zero component of a unit vector; keeps 0 / 0 out of the tests
 Kind = IntEnum(
     'Kind', 'TERRAIN BOX WALL POLE OVERHANG REFLECTION VEGETATION PERSON CYCLIST', start=0
 )
@@ -45,7 +45,7 @@ class Solid(ABC):
     top: float
     radius: float  # of the vertical cylinder around it
     # x, y [m] of the vehicle or person that it is a part of.
-    part_of: tuple[float, float] | None = field(default=None, kw_only=True)
+    part_of: Place | None = field(default=None, kw_only=True)
 
     @abstractmethod
     def _outline(self, offset: FloatArray, rate: FloatArray) -> list[Interval]:
@@ -57,10 +57,15 @@ class Solid(ABC):
     def entry(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
         """Range [m] at which each ray (R, 3) enters the solid, infinite if it does not, (R,)."""
         offset = origin - np.array([self.x, self.y, 0.0])
-        between = slab(self.bottom, self.top, offset[:, 2], direction[:, 2])
+        rate = np.where(np.abs(direction[:, 2]) < SMALLEST_RATE, SMALLEST_RATE, direction[:, 2])
+        ends = (np.array([[self.bottom], [self.top]]) - offset[:, 2]) / rate
+        between = ends.min(axis=0), ends.max(axis=0)
         intervals = np.array([between, *self._outline(offset, direction)])
         enter, leave = intervals[:, 0].max(axis=0), intervals[:, 1].min(axis=0)
         return np.where((enter <= leave) & (enter > 0.0), enter, np.inf)
+
+
+Solids: TypeAlias = tuple[Solid, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,13 +100,6 @@ class Cylinder(Solid):
         return [(enter, np.where(miss, -np.inf, (-half_b + root) / a))]
 
 
-def slab(low: float, high: float, position: FloatArray, rate: FloatArray) -> Interval:
-    """Ranges between which a coordinate that grows at `rate` is from `low` to `high`."""
-    rate = np.where(np.abs(rate) < SMALLEST_RATE, SMALLEST_RATE, rate)
-    at_low, at_high = (low - position) / rate, (high - position) / rate
-    return np.minimum(at_low, at_high), np.maximum(at_low, at_high)
-
-
 def nearest_solid(
     solids: Sequence[Solid], origin: FloatArray, direction: FloatArray
 ) -> tuple[FloatArray, IntArray]:
@@ -126,7 +124,7 @@ def nearest_solid(
 
 def number_objects(solids: Iterable[Solid]) -> npt.NDArray[np.int32]:
     """Return the number of the object that each solid is a part of, from 1 on; 0: of none."""
-    numbers: dict[tuple[float, float], int] = {}
+    numbers: dict[Place, int] = {}
     parts = [solid.part_of for solid in solids]
     found = [0 if part is None else numbers.setdefault(part, len(numbers) + 1) for part in parts]
     return np.array(found, dtype=np.int32)
@@ -145,7 +143,7 @@ def object_heights(terrain: Terrain, solids: Sequence[Solid]) -> FloatArray:
     return heights
 
 
-def parts_of(x: float, y: float, solids: Iterable[Solid]) -> tuple[Solid, ...]:
+def parts_of(x: float, y: float, solids: Iterable[Solid]) -> Solids:
     """Return the solids as parts of the one object at x, y."""
     return tuple(replace(solid, part_of=(x, y)) for solid in solids)
 
@@ -185,16 +183,14 @@ def floating_box(
 
 
 def upright(
-    terrain: Terrain, kind: Kind, at: tuple[float, float], low: float, high: float, radius: float
+    terrain: Terrain, kind: Kind, at: Place, low: float, high: float, radius: float
 ) -> Cylinder:
     """Cylinder between two heights over the terrain [m]."""
     ground = float(terrain.height(*at))
     return Cylinder(kind, *at, ground + low, ground + high, radius)
 
 
-def crate(
-    terrain: Terrain, x: float, y: float, height: float, yaw: float = 0.0
-) -> tuple[Solid, ...]:
+def crate(terrain: Terrain, x: float, y: float, height: float, yaw: float = 0.0) -> Solids:
     """Crate, an object of its own."""
     return parts_of(x, y, [standing_box(terrain, x, y, (0.8, 0.6, height), yaw)])
 
@@ -206,22 +202,20 @@ def pole(
     return upright(terrain, Kind.POLE, (x, y), -BURIED_DEPTH, height, radius)
 
 
-def car(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Solid, ...]:
+def car(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> Solids:
     """Car: a body and a cabin."""
     body, cabin = (4.3, 1.8, 0.9), (2.3, 1.6, 1.5)
     return parts_of(x, y, (standing_box(terrain, x, y, size, yaw) for size in (body, cabin)))
 
 
-def truck(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Solid, ...]:
+def truck(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> Solids:
     """Truck: a load and a lower cab in front of it."""
     cab_x, cab_y = x + 4.2 * math.cos(yaw), y + 4.2 * math.sin(yaw)
     load = standing_box(terrain, x, y, (6.4, 2.5, 3.6), yaw)
     return parts_of(x, y, (load, standing_box(terrain, cab_x, cab_y, (1.8, 2.3, 2.6), yaw)))
 
 
-def wall(
-    terrain: Terrain, start: tuple[float, float], end: tuple[float, float], height: float
-) -> tuple[Hull, ...]:
+def wall(terrain: Terrain, start: Place, end: Place, height: float) -> tuple[Hull, ...]:
     """Wall from `start` to `end` (x, y) [m], in panels that follow the ground."""
     dx, dy = end[0] - start[0], end[1] - start[1]
     n_panels = max(1, math.ceil(math.hypot(dx, dy) / WALL_PANEL))
@@ -234,7 +228,7 @@ def wall(
     )
 
 
-def tree(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
+def tree(terrain: Terrain, x: float, y: float) -> Solids:
     """Tree: a trunk and a floating crown."""
     trunk = pole(terrain, x, y, height=3.0, radius=0.18)
     return trunk, floating_box(terrain, x, y, (3.0, 3.0, 3.0), 2.5, Kind.VEGETATION)

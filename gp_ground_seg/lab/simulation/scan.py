@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from gp_ground_seg.core.frame import FloatArray
@@ -153,7 +154,7 @@ class SimulatedScan:
 
 
 def simulate_scan(
-    scene: Scene, sensor: SensorModel, rng: np.random.Generator, x: float = 0.0
+    scene: Scene, sensor: SensorModel, rng: Generator, x: float = 0.0
 ) -> SimulatedScan:
     """Scan the scene with the (first) sensor over the place `x` [m] of the drive.
 
@@ -188,11 +189,7 @@ def _rotation_of_vehicle(scene: Scene, x: float) -> FloatArray:
 
 
 def _cast(
-    scene: Scene,
-    sensor: SensorModel,
-    rng: np.random.Generator,
-    position: FloatArray,
-    vehicle: FloatArray,
+    scene: Scene, sensor: SensorModel, rng: Generator, position: FloatArray, vehicle: FloatArray
 ) -> tuple[npt.NDArray[np.float32], KindArray, npt.NDArray[np.int32]]:
     """Points, kinds and objects that one sensor sees.
 

@@ -8,13 +8,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
-import gp_ground_seg.lab.simulation.objects as objects
-import gp_ground_seg.lab.simulation.terrain as landforms
-import gp_ground_seg.lab.simulation.traffic as traffic
 from gp_ground_seg.lab.scoring.objects import LOW_HEIGHTS
+from gp_ground_seg.lab.simulation import objects, traffic
+from gp_ground_seg.lab.simulation import terrain as landforms
 from gp_ground_seg.lab.simulation.objects import Kind, Solid
-from gp_ground_seg.lab.simulation.terrain import Sum, Terrain, ditch, flat, polyline, ramp, rough
+from gp_ground_seg.lab.simulation.terrain import Place, Terrain, ditch, flat, polyline, ramp, rough
 
 N_SCATTERED, SCATTER_X, SCATTER_Y = 36, (-60.0, 100.0), (6.0, 35.0)
 """Scattered solids, and their distance from the drive [m], which leaves its lane free."""
@@ -57,7 +57,7 @@ class Scene:
 Parts = Iterator[Any]  # the terrain of a scene, then the solids on it and its wet patches
 
 
-def _open(make: Callable[[np.random.Generator], Terrain], rng: np.random.Generator) -> Parts:
+def _open(make: Callable[[Generator], Terrain], rng: Generator) -> Parts:
     """Terrain with cars, crates, walls, poles and trees on both sides of the drive."""
     yield (terrain := make(rng))
     for k in range(N_SCATTERED):
@@ -79,7 +79,7 @@ def _open(make: Callable[[np.random.Generator], Terrain], rng: np.random.Generat
                 yield from objects.wall(terrain, (x, y), (x + along, y), rng.uniform(1.0, 2.5))
 
 
-_OPEN_COUNTRY: dict[str, Callable[[np.random.Generator], Terrain]] = {
+_OPEN_COUNTRY: dict[str, Callable[[Generator], Terrain]] = {
     # Level ground.
     'flat': lambda rng: flat(),
     # Plane that rises or falls by 8 % in a random direction.
@@ -99,7 +99,7 @@ _OPEN_COUNTRY: dict[str, Callable[[np.random.Generator], Terrain]] = {
 }
 
 
-def _urban(rng: np.random.Generator) -> Parts:
+def _urban(rng: Generator) -> Parts:
     """Street: kerbs, parked cars, a truck, houses, awnings, poles, trees, a bridge, puddles."""
     road, front = 6.0, 10.0
     yield (terrain := landforms.kerb(road, 0.15))
@@ -131,11 +131,11 @@ class _Line:
     """A line of vehicles along `heading` [rad], `aside` [m] to the left of the origin."""
 
     terrain: Terrain
-    rng: np.random.Generator
+    rng: Generator
     heading: float
     aside: float
 
-    def at(self, along: float, aside: float = 0.0) -> tuple[float, float]:
+    def at(self, along: float, aside: float = 0.0) -> Place:
         """x, y [m] of a place."""
         cos, sin = math.cos(self.heading), math.sin(self.heading)
         aside += self.aside
@@ -143,8 +143,8 @@ class _Line:
 
     def fill(
         self,
-        ends: tuple[float, float],
-        gaps: tuple[float, float],
+        ends: Place,
+        gaps: Place,
         turned: float = 0.0,
         models: Sequence[str] = MIXED,
         share: float = 1.0,
@@ -169,7 +169,7 @@ class _Line:
         return solids, free
 
 
-def _traffic_jam(rng: np.random.Generator) -> Parts:
+def _traffic_jam(rng: Generator) -> Parts:
     """Five lanes of waiting vehicles between kerbs, cyclists between them, persons who cross."""
     yield (terrain := landforms.kerb(8.2, 0.15))
     with_truck = rng.choice([-1, 1])
@@ -196,7 +196,7 @@ def _traffic_jam(rng: np.random.Generator) -> Parts:
             yield from traffic.person(terrain, x, side * rng.uniform(9.0, 12.0))
 
 
-def _car_park(rng: np.random.Generator) -> Parts:
+def _car_park(rng: Generator) -> Parts:
     """Rows of parked cars, 0.6 to 1 m apart, along aisles 6 m wide with persons in them."""
     yield (terrain := landforms.slope(rng.uniform(0.0, 0.02), rng.uniform(-math.pi, math.pi)))
     for aside, side in itertools.product((5.5, 10.6, 21.5, 26.6), (-1.0, 1.0)):
@@ -208,7 +208,7 @@ def _car_park(rng: np.random.Generator) -> Parts:
         yield from traffic.person(terrain, *place)
 
 
-def _hidden_climb(rng: np.random.Generator) -> Parts:
+def _hidden_climb(rng: Generator) -> Parts:
     """Parked cars in a row, and right behind it a street that climbs by 10 to 15 %."""
     heading, near = rng.uniform(-math.pi, math.pi), rng.uniform(4.5, 6.5)
     foot, gradient = near + rng.uniform(1.5, 2.5), rng.uniform(0.1, 0.15)
@@ -225,13 +225,13 @@ def _hidden_climb(rng: np.random.Generator) -> Parts:
             yield from traffic.vehicle(terrain, name, *place, yaw)
 
 
-def _wet_road(rng: np.random.Generator) -> Parts:
+def _wet_road(rng: Generator) -> Parts:
     """Traffic jam in the rain: of the near returns of ground a third is missing or mirrored."""
     yield from _traffic_jam(rng)
     yield WetPatch(0.0, 0.0, 20.0, 0.35, True)
 
 
-def _blind_slope(rng: np.random.Generator) -> Terrain:
+def _blind_slope(rng: Generator) -> Terrain:
     """Slope of 10 to 15 % around a level place 2 to 3 m wide: it begins in the blind spot."""
     gradient, half = rng.uniform(0.1, 0.15), rng.uniform(1.0, 1.5)
     rise = 40.0 * gradient
@@ -239,7 +239,7 @@ def _blind_slope(rng: np.random.Generator) -> Terrain:
     return polyline(rng.uniform(-math.pi, math.pi), corners)
 
 
-def _hedge(rng: np.random.Generator) -> Parts:
+def _hedge(rng: Generator) -> Parts:
     """Path between dense hedges 0.5 to 0.8 m high, with a fence behind one of them."""
     yield (terrain := rough(rng, 0.02, (1.5, 10.0)))
     side = rng.choice([-1.0, 1.0])
@@ -259,18 +259,14 @@ def _hedge(rng: np.random.Generator) -> Parts:
 
 
 def _around(
-    smooth: Terrain,
-    waves: Terrain,
-    rng: np.random.Generator,
-    reach: tuple[float, float],
-    places: Sequence[tuple[float, float]] = (),
+    smooth: Terrain, waves: Terrain, rng: Generator, reach: Place, places: Sequence[Place] = ()
 ) -> Parts:
     """Terrain with small `waves`, and cars, persons, crates, poles and walls in a `reach` [m].
 
     Cars are where `smooth`, the terrain without the waves, is even, and lean with it. There are a
     person and a crate in turns at `places` (x, y) [m] as well.
     """
-    yield (terrain := Sum((smooth, waves)))
+    yield (terrain := landforms.Sum((smooth, waves)))
     for k, place in enumerate(places):
         crate = objects.crate(terrain, *place, rng.uniform(*CRATES))
         yield from crate if k % 2 else traffic.person(terrain, *place)
@@ -298,13 +294,13 @@ def _around(
         taken.append((x, y))
 
 
-def _hills(rng: np.random.Generator) -> Parts:
+def _hills(rng: Generator) -> Parts:
     """Waves of 14 to 45 m, 0.9 m rms, and of 1 to 5 m, 4 cm rms, on which the vehicle leans."""
     smooth = rough(rng, 0.9, (14.0, 45.0))
     yield from _around(smooth, rough(rng, 0.04, (1.0, 5.0)), rng, (6.0, 32.0))
 
 
-def _valley(rng: np.random.Generator) -> Parts:
+def _valley(rng: Generator) -> Parts:
     """Level floor 6 to 10 m wide between sides of 15 to 25 degrees that are 6 m high."""
     floor, gradient = rng.uniform(3.0, 5.0), math.tan(math.radians(rng.uniform(15.0, 25.0)))
     top = floor + 6.0 / gradient
@@ -317,7 +313,7 @@ def _valley(rng: np.random.Generator) -> Parts:
     yield from _around(smooth, waves, rng, (6.0, 24.0), places)
 
 
-def _bank(slope: float, rng: np.random.Generator) -> Parts:
+def _bank(slope: float, rng: Generator) -> Parts:
     """Bank of a slope [rad], 2.5 to 4.5 m high, with persons and crates on it."""
     heading, gradient = rng.uniform(-math.pi, math.pi), math.tan(slope)
     foot, rise = rng.uniform(9.0, 14.0), rng.uniform(2.5, 4.5)
@@ -329,7 +325,7 @@ def _bank(slope: float, rng: np.random.Generator) -> Parts:
     yield from _around(smooth, waves, rng, (6.0, 32.0), places)
 
 
-def _on_ramp(rng: np.random.Generator) -> Parts:
+def _on_ramp(rng: Generator) -> Parts:
     """Ramp of 15 to 25 %, 9 to 17 m long, between level ground; the vehicle stands on it."""
     gradient, behind, ahead = rng.uniform((0.15, 4.0, 5.0), (0.25, 8.0, 9.0)).tolist()
     corners = [(-behind, -gradient * behind), (ahead, gradient * ahead)]
@@ -337,7 +333,7 @@ def _on_ramp(rng: np.random.Generator) -> Parts:
     yield from _around(smooth, rough(rng, 0.01, (1.0, 8.0)), rng, (6.0, 28.0))
 
 
-def _dike(rng: np.random.Generator) -> Parts:
+def _dike(rng: Generator) -> Parts:
     """Dike 5 to 8 m wide, 1 to 2 m above the ground on both sides; the vehicle stands on it."""
     heading, gradient = rng.uniform(-math.pi, math.pi), rng.uniform(0.4, 0.7)
     half, high = rng.uniform(2.5, 4.0), rng.uniform(1.0, 2.0)
@@ -349,17 +345,14 @@ def _dike(rng: np.random.Generator) -> Parts:
     yield from _around(smooth, waves, rng, (6.0, 32.0), places)
 
 
-def _low_box(rng: np.random.Generator) -> objects.Size:
+def _low_box(rng: Generator) -> objects.Size:
     """Size of a box, half of them 0.44 m wide, the others up to 2 m by 2 m."""
     length, width = rng.uniform(0.8, 2.0, 2) if rng.random() < 0.5 else (0.44, 0.44)
     return length, width, float(rng.choice(LOW_HEIGHTS))
 
 
 def _low(
-    ground: str,
-    kind: Kind,
-    size: Callable[[np.random.Generator], objects.Size],
-    rng: np.random.Generator,
+    ground: str, kind: Kind, size: Callable[[Generator], objects.Size], rng: Generator
 ) -> Parts:
     """Low objects all around the sensor, turned at random, each in plain view."""
     yield (terrain := _OPEN_COUNTRY[ground](rng))
@@ -378,7 +371,7 @@ def _low(
         bearing += 2.0 * half + LOW_GAP
 
 
-def _build(name: str, make: Callable[[np.random.Generator], Parts], seed: int) -> Scene:
+def _build(name: str, make: Callable[[Generator], Parts], seed: int) -> Scene:
     """Make a scene of a seed."""
     terrain, *parts = make(np.random.default_rng(seed))
     solids = tuple(part for part in parts if isinstance(part, Solid))
@@ -386,7 +379,7 @@ def _build(name: str, make: Callable[[np.random.Generator], Parts], seed: int) -
     return Scene(name, terrain, solids, wet, name in LEANING)
 
 
-def _named(**makers: Callable[[np.random.Generator], Parts]) -> dict[str, Callable[[int], Scene]]:
+def _named(**makers: Callable[[Generator], Parts]) -> dict[str, Callable[[int], Scene]]:
     """Functions of a seed, by the names of their scenes."""
     return {name: partial(_build, name, make) for name, make in makers.items()}
 

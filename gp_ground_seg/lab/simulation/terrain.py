@@ -19,6 +19,7 @@ import numpy as np
 from gp_ground_seg.core.frame import FloatArray
 
 OptionalArray: TypeAlias = FloatArray | None
+Place: TypeAlias = tuple[float, float]  # two coordinates [m]
 N_WAVES = 8
 TOLERANCE = 1e-9  # height at which a ray has met the terrain; length of an empty piece [m]
 
@@ -157,9 +158,7 @@ def rough(
     return Waves(k, amplitude, phase, flat(1.0) if envelope is None else envelope)
 
 
-def polyline(
-    heading: float, points: Sequence[tuple[float, float]], slope_after: float = 0.0
-) -> Profile:
+def polyline(heading: float, points: Sequence[Place], slope_after: float = 0.0) -> Profile:
     """Profile of straight pieces along `heading` [rad], level before the first corner.
 
     `points` are the corners (u, z) in ascending u [m]; those of the same u are a vertical step

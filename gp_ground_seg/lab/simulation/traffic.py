@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.lab.simulation import objects
-from gp_ground_seg.lab.simulation.objects import Kind, Solid
-from gp_ground_seg.lab.simulation.terrain import Terrain
+from gp_ground_seg.lab.simulation.objects import Kind, Solids
+from gp_ground_seg.lab.simulation.terrain import Place, Terrain
 
-Corners = tuple[tuple[float, float], ...]
+Corners = tuple[Place, ...]
 
 
 class Model(NamedTuple):
@@ -75,9 +75,7 @@ def is_even(terrain: Terrain, x: float, y: float) -> bool:
     return bool(np.ptp(around) < 0.3 * 2.0 * half and abs(bend) < 0.1)
 
 
-def vehicle(
-    terrain: Terrain, name: str, x: float, y: float, yaw: float = 0.0
-) -> tuple[Solid, ...]:
+def vehicle(terrain: Terrain, name: str, x: float, y: float, yaw: float = 0.0) -> Solids:
     """Vehicle, one of `MODELS`, leaning with the terrain at its middle."""
     model = MODELS[name]
     parts = [_extruded(terrain, (x, y, yaw), corners, w, 0.0) for w, corners in model.bodies]
@@ -93,7 +91,7 @@ def vehicle(
 def _extruded(
     terrain: Terrain,
     pose: tuple[float, float, float],
-    corners: Sequence[tuple[float, float]],
+    corners: Sequence[Place],
     width: float,
     aside: float,
 ) -> objects.Hull:
@@ -115,14 +113,14 @@ def _extruded(
     return objects.Hull(Kind.BOX, x, y, bottom, top, radius, np.array(normals), np.array(limits))
 
 
-def person(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
+def person(terrain: Terrain, x: float, y: float) -> Solids:
     """Person 1.7 m tall: legs, trunk and head."""
     parts = (0.0, 0.85, 0.13), (0.8, 1.45, 0.22), (1.4, 1.7, 0.1)
     body = [objects.upright(terrain, Kind.PERSON, (x, y), *part) for part in parts]
     return objects.parts_of(x, y, body)
 
 
-def cyclist(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
+def cyclist(terrain: Terrain, x: float, y: float) -> Solids:
     """Cyclist 1.75 m tall: the bicycle, legs, trunk and head."""
     sizes = (0.0, (1.7, 0.06, 0.68)), (0.3, (0.5, 0.32, 0.65))
     boxes = [objects.floating_box(terrain, x, y, size, low, Kind.CYCLIST) for low, size in sizes]
