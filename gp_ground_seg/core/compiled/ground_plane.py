@@ -50,7 +50,7 @@ def refine(
         for _ in range(n_steps):
             plane = solve_plane(_weighted_moments(x, y, z, inverse, plane), plane)
         if is_possible(plane, max_slope):
-            planes[p] = plane
+            planes[p, 0], planes[p, 1], planes[p, 2] = plane
 
 
 @jit(fastmath=True)

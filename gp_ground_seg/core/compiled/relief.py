@@ -54,14 +54,15 @@ def find_relief(
     """
     reached = reachable(candidates, faces, height, growth, stands)
     terrain, is_known = _fit_planes(candidates, reached, height)
-    if np.abs(terrain).max() <= FADED:
+    if (np.abs(terrain) <= FADED).all():
         return
     _fill(terrain, is_known)
     high = faded(terrain).reshape(_WIDTH, _WIDTH)[1:-1, 1:-1]
     for i in range(N_SIDES - 1):
         for j in range(N_SIDES - 1):
             a, b, c, d = high[i, j], high[i + 1, j], high[i, j + 1], high[i + 1, j + 1]
-            pieces[i, j] = piece_of(a, b, c, d)
+            for k, value in enumerate(piece_of(a, b, c, d)):
+                pieces[i, j, k] = value
     for k in range(len(z)):
         u = from_first_middle(candidates.x[k], np.float64)
         v = from_first_middle(candidates.y[k], np.float64)
@@ -105,7 +106,9 @@ def _fit_planes(
         sums = _sums_around(x, y, z, height, weight, square)
         for k in range(_N_SQUARES):
             if number[k] > 0:
-                plane[k] = plane_of(sums[k])
+                # Element by element: assigned tuples take seconds to compile.
+                for i, value in enumerate(plane_of(sums[k])):
+                    plane[k, i] = value
         for c in range(len(x)):
             if reached[c]:
                 there = height_of(plane[square[c]], x[c], y[c])
@@ -115,9 +118,8 @@ def _fit_planes(
             k = _place(i, j)
             # Most squares have no terrain about them.
             if sums[k, 0] >= MIN_WEIGHT:
-                plane[k] = plane_of(sums[k])
                 is_known[k] = True
-                terrain[k] = height_of(plane[k], middle_of(i), middle_of(j))
+                terrain[k] = height_of(plane_of(sums[k]), middle_of(i), middle_of(j))
     return terrain, is_known
 
 

@@ -34,10 +34,6 @@ from gp_ground_seg.core.pipeline.vertical_faces import (
     vote_on_scatter,
 )
 
-# Each tall tile has two rows, for the lowest returns and for those above: their sums. The first
-# row also holds the origin of the tile.
-_X, _Y, _BASE, N_COLUMNS = SUMS, SUMS + 1, SUMS + 2, SUMS + 3
-
 
 @jit(entry=True)
 def find_faces(
@@ -51,8 +47,8 @@ def find_faces(
             cell, t = m * n_bins + candidates.bin[c], candidates.tile[c]
             is_foot = candidates.z[c] - np.float64(tiles.extremes[t, 0]) <= tolerance
             shows_ground[t] |= is_foot and is_flat(scan.extent[cell], tolerance)
-    tall, tile_to_row = _select_tall(tiles, height, label)
-    sums = _sum_returns(scan.xyz, tiles, tall, config.cell_size, height, label, tile_to_row)
+    tall, number = _select_tall(tiles, height, label)
+    sums = _sum_returns(scan.xyz, tiles, tall, config.cell_size, height, label, number)
     whole = np.empty((len(tall), SUMS))
     for k in range(len(tall)):
         t, low, high = np.uintp(tall[k]), sums[2 * k], sums[2 * k + 1]
@@ -143,15 +139,15 @@ def _merged(
 
 @jit()
 def _select_tall(tiles: Tiles, height: float, label: LabelConfig) -> tuple[CellArray, CellArray]:
-    """List the tiles to examine, (K,), and the first of the two rows of each, or `OUTSIDE`."""
+    """List the tiles to examine, (K,), and the place of each in the list, or `OUTSIDE`."""
     extremes, n_tiles, n_tall = tiles.extremes, len(tiles.extremes), 0
-    tall, tile_to_row = np.empty(n_tiles, np.int32), np.full(n_tiles, OUTSIDE, np.int32)
+    tall, number = np.empty(n_tiles, np.int32), np.full(n_tiles, OUTSIDE, np.int32)
     for t in range(n_tiles):
         low, high = np.float64(extremes[t, 0]), np.float64(extremes[t, 1])
         if is_examined(high - low, low + height, tiles.place[t], label):
-            tall[n_tall], tile_to_row[t] = t, 2 * n_tall
+            tall[n_tall], number[t] = t, n_tall
             n_tall += 1
-    return tall[:n_tall], tile_to_row
+    return tall[:n_tall], number
 
 
 @jit()
@@ -162,35 +158,36 @@ def _sum_returns(
     tile_size: float,
     height: float,
     label: LabelConfig,
-    tile_to_row: CellArray,
+    number: CellArray,
 ) -> FloatArray:
-    """Sum over the returns, (3, N), in tall tiles: (2 * K, N_COLUMNS)."""
-    n_sides, sums = int(math.sqrt(len(tiles.at))), np.zeros((2 * len(tall), N_COLUMNS))
-    half = 0.5 * n_sides * tile_size
+    """Sum over the lowest returns, (3, N), of tall tiles, and over those above: (2 * K, SUMS)."""
+    n_sides, sums = int(math.sqrt(len(tiles.at))), np.zeros((2 * len(tall), SUMS))
+    half, origin = 0.5 * n_sides * tile_size, np.empty((len(tall), 3))
     for k in range(len(tall)):
         place = tiles.place[tall[k]]
         # A division of whole numbers takes longer.
         column = np.int32((place + 0.5) / n_sides)
         # About a point near the tile: about the sensor, rounding would exceed the scatter.
-        sums[2 * k, _X] = in_units((column & FIRST) * tile_size - half)
-        sums[2 * k, _Y] = in_units((place - column * n_sides & FIRST) * tile_size - half)
-        sums[2 * k, _BASE] = tiles.extremes[tall[k], 0]
+        origin[k, 0] = in_units((column & FIRST) * tile_size - half)
+        origin[k, 1] = in_units((place - column * n_sides & FIRST) * tile_size - half)
+        origin[k, 2] = tiles.extremes[tall[k], 0]
     foot_height, max_height = label.ground_tolerance, label.obstacle_max_height
     x, y, z, tile = columns[0], columns[1], columns[2], tiles.tile
     for i in range(len(tile)):
         if tile[i] == OUTSIDE:
             continue
-        k = tile_to_row[np.uintp(tile[i])]
+        k = number[np.uintp(tile[i])]
         if k == OUTSIDE:
             continue
-        low = sums[np.uintp(k)]
-        above = np.float64(z[i]) - low[_BASE]
+        own = np.uintp(k)
+        above = np.float64(z[i]) - origin[own, 2]
         if above > max_height:
             continue
-        dx, dy = in_units(np.float64(x[i]) - low[_X]), in_units(np.float64(y[i]) - low[_Y])
+        dx = in_units(np.float64(x[i]) - origin[own, 0])
+        dy = in_units(np.float64(y[i]) - origin[own, 1])
         dz = in_units(np.float64(z[i]) + height)
         # No branch: whether a return is one of the lowest is unpredictable.
-        s = sums[np.uintp(k + np.int32(above > foot_height))]
+        s = sums[np.uintp(2 * k + np.int32(above > foot_height))]
         s[0] += 1.0
         s[1] += dx
         s[2] += dy

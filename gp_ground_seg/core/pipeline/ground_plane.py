@@ -146,7 +146,7 @@ def fit_plane(cells: LowestPoints, max_slope: float, is_left: BoolArray) -> tupl
 
     It is chosen by the points that are left, (C,), of which those on it are then taken.
     """
-    planes, weight = hypotheses(cells, max_slope), np.where(is_left, cells.weight, 0.0)
+    planes, weight = hypotheses(cells, max_slope), cells.weight * is_left
     first, score, _ = best_of(planes, cells, weight, 0.0)
     plane, other_height = own_level(cells, first, score, max_slope)
     is_left[np.abs(distance(cells.x, cells.y, cells.z, plane) * cells.inverse) <= 1.0] = False
@@ -167,7 +167,7 @@ def own_level(
     # Points of the best plane, and those that lie alone, are of no other level.
     d = np.abs(distance(x, y, z, best))
     is_left = (d * inverse > 1.0) & ~cells.is_alone
-    weight = np.where(is_left, cells.weight, 0.0)
+    weight = cells.weight * is_left
     others = other_levels(best, cells, is_left)
     other, score, support = best_of(others, cells, weight, OTHER_SHARE * best_score)
     from_other = np.abs(distance(x, y, z, other))
@@ -175,15 +175,15 @@ def own_level(
     if support > TIGHT * RESOLUTION * whole:
         if asideness(cells, other, best) < OWN * asideness(cells, best, other):
             best, other, d, from_other = other, best, from_other, d
-        inverse = np.where(d <= from_other, inverse, 0.0)
+        inverse = inverse * (d <= from_other)
     planes = np.array([best, (best[0], 0.0, 0.0)])
     refine(x, y, z, inverse, planes[:1], max_slope, N_REFINEMENTS)
-    if CLEAR_TILT < math.hypot(planes[0, 1], planes[0, 2]) < STRAIGHT:
+    best = planes[0, 0], planes[0, 1], planes[0, 2]
+    if CLEAR_TILT < math.hypot(best[1], best[2]) < STRAIGHT:
         # Low shelves on one side tilt a plane, without more support than a level one has.
         refine(0.0 * x, 0.0 * y, z, inverse, planes[1:], max_slope, N_REFINEMENTS)
-        planes[0] = best_of(planes, cells, cells.weight, 0.0)[0]
-    other_height = other[0] if score > 0.0 else math.inf
-    return (planes[0, 0], planes[0, 1], planes[0, 2]), other_height
+        best = best_of(planes, cells, cells.weight, 0.0)[0]
+    return best, other[0] if score > 0.0 else math.inf
 
 
 @shared
@@ -195,8 +195,8 @@ def hypotheses(cells: LowestPoints, max_slope: float) -> FloatArray:
     n, n_level = len(cells.z), min(len(cells.z), N_LEVEL)
     if n < MIN_CELLS:
         return np.zeros((0, 3))
-    level = np.zeros((n_level, 3))
-    level[:, 0] = -cells.z[np.arange(n_level) * n // n_level]
+    height, flat = -cells.z[np.arange(n_level) * n // n_level], np.zeros(n_level)
+    level = np.column_stack((height, flat, flat))
     tilted = planes_through(cells, (SPREAD * n).astype(np.int64).T)
     level = level[is_possible(level.T, max_slope)]
     tilted = tilted[is_possible(tilted.T, max_slope)]
@@ -433,8 +433,9 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> tuple[f
     is_over = (d * inverse > CLEARLY_OFF) & (cells.z < 0.0) & is_first
     is_below = (d * inverse < -CLEARLY_OFF) & ~cells.is_alone
     # Floor at the foot of a wall lies alone.
-    is_off, lowest = np.abs(d * inverse) > 1.0, distance(cells.x, cells.y, cells.lowest_z, plane)
-    d, z = np.where(is_off, lowest, d), np.where(is_off, cells.lowest_z, cells.z)
+    is_off = np.abs(d * inverse) > 1.0
+    z = is_off * cells.lowest_z + ~is_off * cells.z
+    d = distance(cells.x, cells.y, z, plane)
     is_on = np.abs(d * inverse) <= 1.0
     n = int(np.count_nonzero(is_on))
     if n == 0:
