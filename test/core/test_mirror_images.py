@@ -9,20 +9,15 @@ from rooms import HALL
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
+from gp_ground_seg.core.pipeline import mirror_images
 from gp_ground_seg.core.pipeline.ground_plane import find_planes
-from gp_ground_seg.core.pipeline.mirror_images import (
-    DEEP,
-    MIRRORED,
-    find_mirror_images,
-    in_sight,
-    mirror_share,
-)
 from gp_ground_seg.core.pipeline.points import moved
 from gp_ground_seg.lab.simulation import SENSORS, Scene
 from gp_ground_seg.lab.simulation.objects import floating_box
 from gp_ground_seg.lab.simulation.scenes import WetPatch
 
-WET = [('hdl-64e', 0), ('vlp-16', 1)]
+TURNED = dataclasses.replace(SENSORS['vlp-16'], roll=0.03, pitch=-0.03)
+WET = [('hdl-64e', 0), ('hdl-64e', 1), ('vlp-16', 1), (TURNED, 1)]
 DRY = ['ramp', 'rough', 'ditch', 'dike', 'hills', 'urban', 'car_park', 'low_boxes']
 
 
@@ -32,7 +27,7 @@ def images_in(points, sensor):
     pose = GroundSegmenter(config).segment(points).pose
     about = moved(points[:, :3], pose.origin)
     scan = NumpyBackend().build_grid(pose.level(np.ascontiguousarray(about)), config)
-    found = find_mirror_images(scan, pose, None)
+    found = mirror_images.find_mirror_images(scan, pose, None)
     return np.isin(np.arange(len(points)), found.points), found
 
 
@@ -42,7 +37,7 @@ def test_images_are_found_and_raised_and_the_wet_road_is_ground(backend, sensor,
     points, truth = scan.points, scan.is_ground
     height = points[:, 2] - scan.ground_z
     is_image, found = images_in(points, Config().sensor)
-    is_deep = ~truth & (height < -DEEP - 0.1)
+    is_deep = ~truth & (height < -mirror_images.DEEP - 0.1)
     assert is_deep.sum() > 300
     assert is_image[is_deep].mean() > 0.98
     assert not is_image[truth | (height > 0.0)].any()
@@ -75,9 +70,12 @@ def test_a_dry_scan_has_no_images(scene, sensor):
         assert not images_in(lifted, Config().sensor)[0].any()
 
 
-def test_images_are_told_by_where_rays_start():
-    points = simulated('wet_road', 'hdl-64e', 0).points
+@pytest.mark.parametrize('sensor', ['hdl-64e', 'vlp-16-low'])
+def test_images_are_told_by_where_rays_start(sensor):
+    scan = simulated('wet_road', sensor, 0)
+    points, is_deep = scan.points, scan.points[:, 2] - scan.ground_z < -0.3
     expected = images_in(points, Config().sensor)[0]
+    assert expected[is_deep].mean() > 0.98
     lifted = points[:, :3] + np.float32([0.0, 0.0, 1.5])
     told = Config().replace(**{'sensor.origin_z': 1.5}).sensor
     assert (images_in(lifted, told)[0] != expected).mean() < 1e-3
@@ -123,7 +121,8 @@ def test_a_polished_floor_is_a_mirror_and_tables_are_not():
     ):
         points = hall(height, steepest, **kind).points[:, :3]
         scan = NumpyBackend().build_grid(np.ascontiguousarray(points), Config())
-        plane = next(find_planes(in_sight(scan.candidates), 1.0))
-        share = mirror_share(plane, scan)
+        plane = next(find_planes(mirror_images.in_sight(scan.candidates), 1.0))
+        share = mirror_images.mirror_share(plane, scan)
         assert -plane.height == pytest.approx(plane_z, abs=0.03)
-        assert share > MIRRORED + 0.2 if 'share' in kind else share < MIRRORED - 0.1
+        least = mirror_images.MIRRORED
+        assert share > least + 0.2 if 'share' in kind else share < least - 0.1
