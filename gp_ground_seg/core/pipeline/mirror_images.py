@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray, PointArray, Scan
-from gp_ground_seg.core.pipeline.ground_plane import LEVEL, GroundPlane, crossing_of
+from gp_ground_seg.core.pipeline.ground_plane import GroundPlane, crossing_of
 from gp_ground_seg.core.pipeline.ground_view import View
 from gp_ground_seg.core.pipeline.lowest_points import tolerance_at
 from gp_ground_seg.core.pipeline.points import rotation
@@ -38,10 +38,11 @@ WET_SHARE, WET_REACH = 0.1, 20.0
 asked for what they are images of."""
 COUNTERPART = 0.2
 """Side of the boxes in which a counterpart is looked for: its own and those around it [m]."""
-MIRRORED = 0.28
+MIRRORED, TILTED = 0.28, 1.3
 """Share of what is deep below a plane that has a counterpart over it, and a ray through what is
 seen of the plane, from which it is a mirror. Simulated wet scans have 0.3 to 0.8, sparse ones 0.23
-to 0.38, tables up to 0.26, crowded rooms and dry land up to 0.11."""
+to 0.38, tables up to 0.26, crowded rooms and dry land up to 0.11. And that of a tilted one over
+that of a level one from which it is the mirror: 1.38 and more at 2 degrees, 1.24 by images."""
 
 
 class MirrorImages(NamedTuple):
@@ -84,7 +85,7 @@ def find_mirror_images(scan: Scan, pose: SensorPose, view: View | None) -> Mirro
     share, tilted_share = mirror_share(level, scan), mirror_share(tilted, scan)
     if max(share, tilted_share) < MIRRORED:
         return NO_IMAGES
-    plane = tilted if tilted_share > LEVEL * share else level
+    plane = tilted if tilted_share > TILTED * share else level
     inside = np.flatnonzero(grid.inside)
     r, z = grid.r[inside].astype(np.float64), plane.below(*scan.xyz[inside].T.astype(np.float64))
     slope, cell = (z - height) / np.maximum(r, NEAREST), grid.cell[inside].astype(np.int64)
