@@ -299,10 +299,12 @@ class GroundSegmenter:
                 c = left.candidates
                 off = np.abs(view.plane.below(c.x, c.y, c.z))
                 near = left._replace(candidates=c.where(off < 2.0 * tolerance_at(c.r)))
-                again = self._look(near) or view
+                plane = (self._look(near) or view).plane
+                is_below = is_below_sensor(plane, scan)
+                again = View(plane._replace(is_below_sensor=is_below), UPRIGHT, is_mirror=True)
                 # Walls close by have returns where any image would be, and show no plane.
                 if _is_mirror(again, scan):
-                    return again._replace(is_mirror=True)
+                    return again
         return below
 
     def _about_axes(self, xyz: PointArray, below: View | None) -> View | None:

@@ -125,12 +125,9 @@ def find_planes(
     points that are left. `max_slope` is that of the steepest plane to look for, as rise per
     metre; `fit` is `fit_plane`, compiled.
     """
-    cells = lowest_points(candidates)
+    cells, find = lowest_points(candidates), fit or fit_plane
     is_left = np.ones(len(cells.z), dtype=np.bool_)
-    while True:
-        found = GroundPlane(*(fit or fit_plane)(cells, max_slope, is_left))
-        if found.n_support == 0:
-            return
+    while (found := GroundPlane(*find(cells, max_slope, is_left))).n_support > 0:
         yield found
 
 

@@ -162,10 +162,13 @@ def is_below_sensor(plane: GroundPlane, scan: Scan) -> bool:
     """Whether a plane is seen as from a sensor at the origin: steeply, or by a cone of rays."""
     if plane.height < LOW or not LEAST_DEPRESSION <= plane.depression < STEEP_DEPRESSION:
         return plane.depression >= LEAST_DEPRESSION
-    c, steepest = scan.candidates, np.full(N_SECTORS, -np.inf)
-    np.maximum.at(steepest, c.segment * N_SECTORS // c.n_segments, np.arctan2(-c.z, c.r))
-    low, high = np.quantile(steepest[np.isfinite(steepest)], (0.25, 0.75))
-    return bool(high - low < ONE_ANGLE * high)
+    c, steepest = scan.candidates, np.full((N_SECTORS, 2), -np.inf)
+    # The cone is about z, or about the normal in a cloud that was turned.
+    drop = np.column_stack([-c.z, plane.height - plane.below(c.x, c.y, c.z)])
+    angle = np.arctan2(drop, c.r[:, None])
+    np.maximum.at(steepest, c.segment * N_SECTORS // c.n_segments, angle)
+    low, high = np.quantile(steepest[np.isfinite(steepest[:, 0])], (0.25, 0.75), axis=0)
+    return bool((high - low < ONE_ANGLE * high).any())
 
 
 def is_doubtful(below: View | None) -> bool:

@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray, PointArray, Scan
-from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
+from gp_ground_seg.core.pipeline.ground_plane import GroundPlane, crossing_of
 from gp_ground_seg.core.pipeline.ground_view import View
 from gp_ground_seg.core.pipeline.lowest_points import tolerance_at
+from gp_ground_seg.core.pipeline.points import rotation
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
 DEEP, DEEPEST = 0.15, 10.0
@@ -37,9 +38,11 @@ WET_SHARE, WET_REACH = 0.1, 20.0
 asked for what they are images of."""
 COUNTERPART = 0.2
 """Side of the boxes in which a counterpart is looked for: its own and those around it [m]."""
-MIRRORED = 0.4
-"""Share of what is deep below a plane that has a counterpart over it, from which the plane is a
-mirror. Simulated wet scans have 0.45 to 0.88, dry real ones outdoors none: the tiles tell them."""
+MIRRORED, TILTED = 0.28, 1.3
+"""Share of what is deep below a plane that has a counterpart over it, and a ray through what is
+seen of the plane, from which it is a mirror. Simulated wet scans have 0.3 to 0.8, sparse ones 0.23
+to 0.38, tables up to 0.26, crowded rooms and dry land up to 0.11. And that of a tilted one over
+that of a level one from which it is the mirror: 1.38 and more at 2 degrees, 1.24 by images."""
 
 
 class MirrorImages(NamedTuple):
@@ -73,21 +76,25 @@ def find_mirror_images(scan: Scan, pose: SensorPose, view: View | None) -> Mirro
     above the line of sight to ground that is seen nearer. Where rays start must be known, or
     nothing is told. `view` is the plane that the pose was estimated from, if there is one.
     """
-    grid, plane_z = scan.grid, -pose.sensor_height
-    if not pose.starts_rays or plane_z >= 0.0 or (view is not None and view.is_dry):
+    grid, height, seen = scan.grid, pose.sensor_height, pose.measured
+    if seen is None or not pose.starts_rays or height <= 0.0 or (view is not None and view.is_dry):
         return NO_IMAGES
-    is_mirror = view is not None and view.is_mirror and pose.height_estimated
-    if not is_mirror and mirror_share(GroundPlane(pose.sensor_height), scan) < MIRRORED:
+    # The mirror is level, or tilted as far as the sensor was left so.
+    x, y, z = pose.rotation @ rotation(seen.roll, seen.pitch)[2]
+    level, tilted = GroundPlane(height), GroundPlane(height, -x / z, -y / z)
+    share, tilted_share = mirror_share(level, scan), mirror_share(tilted, scan)
+    if max(share, tilted_share) < MIRRORED:
         return NO_IMAGES
+    plane = tilted if tilted_share > TILTED * share else level
     inside = np.flatnonzero(grid.inside)
-    r, z = grid.r[inside].astype(np.float64), scan.xyz[inside, 2].astype(np.float64)
-    slope, cell = slope_of_sight(r, z), grid.cell[inside].astype(np.int64)
-    is_ground = (r >= NEAREST) & (r < GROUND_REACH) & (np.abs(z - plane_z) <= tolerance_at(r))
+    r, z = grid.r[inside].astype(np.float64), plane.below(*scan.xyz[inside].T.astype(np.float64))
+    slope, cell = (z - height) / np.maximum(r, NEAREST), grid.cell[inside].astype(np.int64)
+    is_ground = (r >= NEAREST) & (r < GROUND_REACH) & (np.abs(z) <= tolerance_at(r))
     shape = grid.n_segments, grid.n_bins
     nearer = _nearer_about(slope[is_ground], cell[is_ground], shape, N_ASIDE)[cell]
     # Only a line of sight that points down meets the plane: at its height over its slope.
-    can_be = (nearer < 0.0) & ((slope - nearer) * plane_z > OVER_SIGHT * nearer)
-    can_be &= (r >= NEAREST) & (r < IMAGE_REACH) & (z < plane_z + DEEP)
+    can_be = (nearer < 0.0) & ((nearer - slope) * height > OVER_SIGHT * nearer)
+    can_be &= (r >= NEAREST) & (r < IMAGE_REACH) & (z < DEEP)
     low = np.flatnonzero(can_be)
     bare = np.flatnonzero(is_ground & (slope >= nearer))
     extremes = scan.tiles.extremes[scan.tiles.tile[inside[bare]]]
@@ -97,10 +104,9 @@ def find_mirror_images(scan: Scan, pose: SensorPose, view: View | None) -> Mirro
         tells = bare[~is_image[bare]]
         before = _ground_before(z[tells], cell[tells], shape)[cell[low]]
         is_seen = np.isfinite(before)
-        mirror_z = np.where(is_seen, before, plane_z)
+        mirror_z = np.where(is_seen, before, 0.0)
         is_image[low] = is_deep = z[low] < mirror_z - np.where(is_seen, BELOW, DEEP)
-    rise = 2.0 * (mirror_z - z[low])
-    return MirrorImages(inside[low[is_deep]], rise[is_deep])
+    return MirrorImages(inside[low[is_deep]], 2.0 * (mirror_z - z[low])[is_deep])
 
 
 @np.errstate(invalid='ignore', over='ignore')
@@ -108,35 +114,33 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     """Share of what is deep below a plane that is the image of another return; 0 if little is.
 
     A wet road mirrors what stands on it: raised over the road again, its image meets other returns
-    of it. What is seen of a valley, or below a table or a dock, meets none.
+    of it, and the ray to it crosses the road where it is seen. What is seen of a valley meets
+    none; rays to the floor between tables, or of a crowded room, cross a plane beside its returns.
     """
-    candidates = scan.candidates
-    over = plane.below(candidates.x, candidates.y, candidates.z)
-    near = (candidates.r >= NEAREST) & (candidates.r < WET_REACH)
+    c, grid = scan.candidates, scan.grid
+    over = plane.below(c.x, c.y, c.z)
+    near = (c.r >= NEAREST) & (c.r < WET_REACH)
     deep = np.flatnonzero(near & (over < -DEEP) & (over > -DEEPEST))
-    is_on_it = near & (np.abs(over) <= tolerance_at(candidates.r))
-    if len(deep) <= WET_SHARE * np.count_nonzero(is_on_it):
+    is_on_it = np.abs(over) <= tolerance_at(c.r)
+    if len(deep) <= WET_SHARE * np.count_nonzero(near & is_on_it):
         return 0.0
-    place = np.column_stack([candidates.x[deep], candidates.y[deep], candidates.z[deep]])
-    normal, tile = plane.normal, candidates.tile[deep]
-    raised = place - (2.0 * over[deep] * normal[2])[:, None] * normal
-    # A valley has little above it that is as high: no need to look closer.
-    if np.mean(scan.tiles.extremes[tile, 1] > raised[:, 2] - COUNTERPART) < MIRRORED:
-        return 0.0
+    place = np.column_stack([c.x, c.y, c.z])[deep]
+    raised = place - (2.0 * over[deep] * plane.normal[2])[:, None] * plane.normal
     # Boxes with a return, and a margin of one on all sides.
     low = raised.min(axis=0) - 2.0 * COUNTERPART
     shape = ((raised.max(axis=0) - low) / COUNTERPART).astype(np.int64) + 3
-    strides = np.array([shape[1] * shape[2], shape[2], 1])
-    inside, index = plane.below(*scan.xyz.T) > DEEP, np.zeros(len(scan.xyz), dtype=np.int64)
-    for column, least, n, stride in zip(scan.xyz.T, low.tolist(), shape, strides, strict=True):
-        box = (column - least) / COUNTERPART
-        inside &= (box > 0.0) & (box < n)
-        index += box.astype(np.int64) * stride
-    has_return = np.zeros(math.prod(shape.tolist()), dtype=np.bool_)
-    has_return[index[inside]] = True
-    around = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 3) @ strides
-    boxes = ((raised - low) / COUNTERPART).astype(np.int64) @ strides
-    return float(has_return[np.add.outer(boxes, around)].any(axis=1).mean())
+    box = (scan.xyz[plane.below(*scan.xyz.T) > DEEP] - low) / COUNTERPART
+    box = box[((box > 0.0) & (box < shape)).all(axis=1)].astype(np.int64)
+    has_return = np.zeros(shape, dtype=np.bool_)
+    has_return[tuple(box.T)] = True
+    around = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 1, 3)
+    boxes = ((raised - low) / COUNTERPART).astype(np.int64) + around
+    is_image = has_return[tuple(boxes.T)].any(axis=1)
+    # The plane is seen in the bin that the ray crosses, or the one before or behind.
+    cell, crossing = c.segment * grid.n_bins + c.bin, crossing_of(c.r[deep], over[deep], plane[:3])
+    crossed = cell[deep] - c.bin[deep] + np.searchsorted(grid.edges[1:], crossing, side='right')
+    is_image &= np.isin(crossed + np.array([[-1], [0], [1]]), cell[is_on_it]).any(axis=0)
+    return float(is_image.mean())
 
 
 def in_sight(candidates: Candidates) -> Candidates:
@@ -145,17 +149,12 @@ def in_sight(candidates: Candidates) -> Candidates:
     Mirror images may be the lowest returns of most cells: a plane through these is that of a
     ceiling, or of nothing.
     """
-    slope = slope_of_sight(candidates.r, candidates.z)
+    slope = candidates.z / np.maximum(candidates.r, NEAREST)
     shape = candidates.n_segments, int(candidates.bin.max(initial=0)) + 1
     cell = candidates.segment * shape[1] + candidates.bin
     tells = np.flatnonzero((candidates.r >= NEAREST) & (slope < 0.0))
     nearer = _nearer_about(slope[tells], cell[tells], shape, 1)[cell]
     return candidates.where((slope < 0.0) & (slope >= nearer))
-
-
-def slope_of_sight(r: FloatArray, z: FloatArray) -> FloatArray:
-    """Slope of the line of sight to returns at a range and a height [m]."""
-    return np.asarray(z / np.maximum(r, NEAREST))
 
 
 def _nearer_about(
@@ -168,10 +167,8 @@ def _nearer_about(
     """
     own: FloatArray = np.full(shape, -np.inf)
     np.maximum.at(own.reshape(-1), cell, slope)
-    highest = own
-    for aside in range(1, n_aside + 1):
-        both = np.maximum(np.roll(own, aside, axis=0), np.roll(own, -aside, axis=0))
-        highest = np.maximum(highest, both)
+    asides = range(-n_aside, n_aside + 1)
+    highest = np.max([np.roll(own, aside, axis=0) for aside in asides], axis=0)
     before: FloatArray = np.full(shape, -np.inf)
     np.maximum.accumulate(highest[:, :-1], axis=1, out=before[:, 1:])
     return before.reshape(-1)
