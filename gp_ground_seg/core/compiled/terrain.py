@@ -207,10 +207,12 @@ def _step_in_front(candidates: Candidates, steep: IntArray, walk: _Walk) -> None
             beside = (segment[k] + aside) % n_segments
             gap = OBLIQUE * aside * arc_of(candidates.r[steep[k] - 1], n_segments)
             _join_front(candidates, steep, k, gap, starts[beside : beside + 2], front)
-    width = np.zeros(len(steep))
+    width, newest = np.zeros(len(steep)), np.full(len(steep), -1)
     for k in range(len(steep)):
         front[k] = _root(front, k)
-        width[front[k]] += arc_of(candidates.r[steep[k] - 1], n_segments)
+        if newest[front[k]] != segment[k]:
+            newest[front[k]] = segment[k]
+            width[front[k]] += arc_of(candidates.r[steep[k] - 1], n_segments)
     for k in range(len(steep)):
         is_wide = width[front[k]] >= MIN_WIDTH
         if walk.is_fallen[steep[k]]:

@@ -163,7 +163,9 @@ def _in_front(candidates: Candidates, near: IntArray) -> BoolArray:
         overlaps = (low[other] <= high[one]) & (low[one] <= high[other])
         pairs.append(np.stack([one, other])[:, overlaps])
     front = _groups(n, *np.concatenate(pairs, axis=1))
-    width = np.bincount(front, arc_of(begin, n_segments))
+    # A segment with several steps counts once, by the nearest.
+    once = np.unique(front * n_segments + segment, return_index=True)[1]
+    width = np.bincount(front[once], arc_of(begin[once], n_segments))
     result: BoolArray = (width >= MIN_WIDTH)[front]
     return result
 
