@@ -71,11 +71,7 @@ def bank(degrees, foot, high=3.0):
 @pytest.mark.parametrize('degrees', [15, 25, 35, -20])
 def test_the_relief_is_that_of_a_bank(backend, degrees):
     side = math.copysign(1.0, degrees)
-
-    def terrain(x, y):
-        return side * bank(abs(degrees), 10.0)(x, y)
-
-    candidates = candidates_on(terrain, RINGS)
+    candidates = candidates_on(lambda x, y: side * bank(abs(degrees), 10.0)(x, y), RINGS)
     relief, over, _ = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
     missed = over.z + HEIGHT
     assert np.abs(candidates.z + HEIGHT).max() == pytest.approx(3.0)
@@ -167,10 +163,8 @@ def test_what_stands_on_the_ground_has_ground_before_and_behind_it(backend, name
 def test_land_behind_a_gap_between_rings_does_not_stand(backend):
     """A pitched sensor with 16 beams: no step of the allowed length leads to its far rings."""
     rings = np.array([3.0, 3.6, 4.2, 5.0, 6.2, 7.0, 11.0, 18.0, 30.0])
-    road = box(7.2, 24.0, -6.0, 6.0, 0.045)
-    candidates = candidates_on(lambda x, y: x * road(x, y), rings)
-    faces = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())[2]
-    assert not faces.is_face.any()
+    candidates = candidates_on(lambda x, y: x * box(7.2, 24.0, -6.0, 6.0, 0.045)(x, y), rings)
+    assert not backend.find_relief(candidates, NO_FACES, HEIGHT, Config())[2].is_face.any()
 
 
 def test_no_way_leads_over_returns_that_are_too_steep(backend):
