@@ -124,8 +124,18 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     is_on_it = np.abs(over) <= tolerance_at(c.r)
     if len(deep) <= WET_SHARE * np.count_nonzero(near & is_on_it):
         return 0.0
-    place = np.column_stack([c.x, c.y, c.z])[deep]
+    place = np.column_stack([c.x[deep], c.y[deep], c.z[deep]])
     raised = place - (2.0 * over[deep] * plane.normal[2])[:, None] * plane.normal
+    # A valley has little above it that is as high: no need to look closer.
+    is_below = scan.tiles.extremes[c.tile[deep], 1] > raised[:, 2] - COUNTERPART
+    if is_below.mean() < MIRRORED:
+        return 0.0
+    # The plane is seen in the bin that the ray crosses, or the one before or behind.
+    cell, crossing = c.segment * grid.n_bins + c.bin, crossing_of(c.r[deep], over[deep], plane[:3])
+    crossed = cell[deep] - c.bin[deep] + np.searchsorted(grid.edges[1:], crossing, side='right')
+    is_crossed = np.isin(crossed + np.array([[-1], [0], [1]]), cell[is_on_it]).any(axis=0)
+    if is_crossed.mean() < MIRRORED:
+        return 0.0
     # Boxes with a return, and a margin of one on all sides.
     low = raised.min(axis=0) - 2.0 * COUNTERPART
     shape = ((raised.max(axis=0) - low) / COUNTERPART).astype(np.int64) + 3
@@ -135,12 +145,7 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     has_return[tuple(box.T)] = True
     around = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 1, 3)
     boxes = ((raised - low) / COUNTERPART).astype(np.int64) + around
-    is_image = has_return[tuple(boxes.T)].any(axis=1)
-    # The plane is seen in the bin that the ray crosses, or the one before or behind.
-    cell, crossing = c.segment * grid.n_bins + c.bin, crossing_of(c.r[deep], over[deep], plane[:3])
-    crossed = cell[deep] - c.bin[deep] + np.searchsorted(grid.edges[1:], crossing, side='right')
-    is_image &= np.isin(crossed + np.array([[-1], [0], [1]]), cell[is_on_it]).any(axis=0)
-    return float(is_image.mean())
+    return float(np.mean(is_crossed & has_return[tuple(boxes.T)].any(axis=1)))
 
 
 def in_sight(candidates: Candidates) -> Candidates:
