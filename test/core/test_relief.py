@@ -83,12 +83,19 @@ def test_the_relief_is_that_of_a_bank(backend, degrees):
     assert (relief.at(np.array([-30.0, 5.0]), np.zeros(2)) == 0.0).all()
 
 
-def test_few_beams_see_a_hillside_in_steps_that_are_high(backend):
-    rings = np.concatenate([np.arange(3.0, 10.1, 0.5), np.arange(11.5, 30.0, 2.2)])
-    candidates = candidates_on(bank(25, 10.0, 6.0), rings)
-    candidates = candidates.where((candidates.x < 10.0) | (np.abs(candidates.y) < 6.0))
-    over = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())[1]
-    assert np.mean(np.abs(over.z + HEIGHT)[over.x > 14.0] < 0.3) > 0.92
+FEW_RINGS = np.concatenate([np.arange(3.0, 10.1, 0.5), np.arange(11.5, 30.0, 2.2)])
+
+
+@pytest.mark.parametrize(
+    ('rings', 'foot', 'first', 'last'), [(FEW_RINGS, 10, -6, 6), (RINGS, 18, 16, 48)]
+)
+def test_hillsides_are_climbed_in_high_steps_and_past_the_sensor(
+    backend, rings, foot, first, last
+):
+    seen = candidates_on(bank(25, foot, 6.0), rings)
+    seen = seen.where((seen.x < foot) | ((seen.y > first) & (seen.y < last)))
+    over = backend.find_relief(seen, NO_FACES, HEIGHT, Config())[1]
+    assert np.mean(np.abs(over.z + HEIGHT)[over.x > foot + 4.0] < 0.3) > 0.9
 
 
 @pytest.mark.parametrize(('at', 'depth', 'share'), [(5, 1.2, 0.95), (7.5, 2, 1), (10, 3, 1)])
