@@ -37,7 +37,7 @@ def test_images_are_found_and_raised_and_the_wet_road_is_ground(backend, sensor,
     points, truth = scan.points, scan.is_ground
     height = points[:, 2] - scan.ground_z
     is_image, found = images_in(points, Config().sensor)
-    is_deep = ~truth & (height < -images.DEEP - 0.1)
+    is_deep, below = (~truth & (height < -least) for least in (images.DEEP + 0.1, 0.3))
     assert is_deep.sum() > 300
     assert is_image[is_deep].mean() > 0.98
     assert not is_image[truth | (height > 0.0)].any()
@@ -48,9 +48,9 @@ def test_images_are_found_and_raised_and_the_wet_road_is_ground(backend, sensor,
     assert missed.max() < 0.35 and np.quantile(missed, 0.9) < 0.05
     result = GroundSegmenter(backend=backend).segment(points)
     assert (result.is_ground & truth).sum() / (result.is_ground | truth).sum() > 0.93
-    assert result.is_ground[is_deep].mean() < 0.01
+    assert result.is_ground[below].mean() < 0.01
     # The ground at an image is above it.
-    off = (result.ground_z - scan.ground_z)[is_deep]
+    off = (result.ground_z - scan.ground_z)[below]
     assert np.nanmedian(np.abs(off)) < 0.01
     # Raised to the underside of a car, an image would be ground that climbs to the roofs behind.
     candidates = result.frame.candidates
@@ -122,4 +122,4 @@ def test_a_polished_floor_is_a_mirror_and_tables_are_not():
         plane = next(find_planes(images.in_sight(scan.candidates), 1.0))
         share = images.mirror_share(plane, scan)
         assert -plane.height == pytest.approx(plane_z, abs=0.03)
-        assert share > images.MIRRORED + 0.2 if 'share' in kind else share < images.MIRRORED - 0.1
+        assert share > 0.6 if 'share' in kind else share < images.MIRRORED - 0.1

@@ -178,7 +178,10 @@ OTHER_QOS = {'depth': 3, 'reliability': 'best_effort'}
 
 def test_quality_of_service_of_every_output_can_be_overridden():
     topics = [o.topic for o in outputs.OUTPUTS]
-    assert {o.topic: o.message_type for o in outputs.OUTPUTS if o.is_optional} == OPTIONAL
+    assert {o.topic: (o.message_type, o.is_optional) for o in outputs.OUTPUTS} == {
+        **dict.fromkeys(('ground', 'obstacles'), (PointCloud2, False)),
+        **{topic: (message, True) for topic, message in OPTIONAL.items()},
+    }
     names = (f'qos_overrides./{topic.replace("~", NODE_NAME)}.publisher' for topic in topics)
     values = {f'{name}.{k}': v for name in names for k, v in OTHER_QOS.items()}
     with ros.started_node(*ros.given(values)) as node:

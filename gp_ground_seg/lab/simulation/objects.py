@@ -20,7 +20,7 @@ Size: TypeAlias = tuple[float, float, float]  # length, width, height [m]
 BURIED_DEPTH = 3.0  # of standing solids below the ground at their centre: none hovers [m]
 WALL_PANEL, WALL_THICKNESS = 4.0, 0.3
 """Longest panel of a wall, whose panels follow the ground, and thickness of all [m]."""
-SMALLEST_RATE = 1e-12  # for a zero component of a unit vector; keeps 0 / 0 out of the tests
+SMALLEST_RATE = 1e-12  # for a zero component of a unit vector; keeps 0 / 0 out of `Solid.entry`
 Kind = IntEnum(
     'Kind', 'TERRAIN BOX WALL POLE OVERHANG REFLECTION VEGETATION PERSON CYCLIST', start=0
 )

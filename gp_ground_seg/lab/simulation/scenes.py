@@ -16,6 +16,7 @@ from gp_ground_seg.lab.simulation import terrain as landforms
 from gp_ground_seg.lab.simulation.objects import Kind, Solid
 from gp_ground_seg.lab.simulation.terrain import Place, Terrain, ditch, flat, polyline, ramp, rough
 
+Span = tuple[float, float]  # the least and the largest distance [m]
 N_SCATTERED, SCATTER_X, SCATTER_Y = 36, (-60.0, 100.0), (6.0, 35.0)
 """Scattered solids, and their distance from the drive [m], which leaves its lane free."""
 CARS = ('saloon', 'hatchback', 'suv')
@@ -143,8 +144,8 @@ class _Line:
 
     def fill(
         self,
-        ends: Place,
-        gaps: Place,
+        ends: Span,
+        gaps: Span,
         turned: float = 0.0,
         models: Sequence[str] = MIXED,
         share: float = 1.0,
@@ -259,7 +260,7 @@ def _hedge(rng: Generator) -> Parts:
 
 
 def _around(
-    smooth: Terrain, waves: Terrain, rng: Generator, reach: Place, places: Sequence[Place] = ()
+    smooth: Terrain, waves: Terrain, rng: Generator, reach: Span, places: Sequence[Place] = ()
 ) -> Parts:
     """Terrain with small `waves`, and cars, persons, crates, poles and walls in a `reach` [m].
 
