@@ -300,6 +300,7 @@ class GroundSegmenter:
                 off = np.abs(view.plane.below(c.x, c.y, c.z))
                 near = left._replace(candidates=c.where(off < 2.0 * tolerance_at(c.r)))
                 plane = (self._look(near) or view).plane
+                # Those near the plane are too few to tell how steeply it is seen.
                 is_below = is_below_sensor(plane, scan)
                 again = View(plane._replace(is_below_sensor=is_below), UPRIGHT, is_mirror=True)
                 # Walls close by have returns where any image would be, and show no plane.

@@ -148,7 +148,7 @@ def variances_of(
     That of the noise is at least the rounding of covariances, `least` of the largest.
     """
     sill, noise, r = math.exp(2.0 * theta[0]), math.exp(2.0 * theta[1]), frame.candidates.r
-    farthest = r[np.argmax(r)] if len(r) > 0 else 0.0
+    farthest = r.max() if len(r) > 0 else 0.0
     return sill, max(noise, least * prior_variance(sill, observation, farthest))
 
 

@@ -430,8 +430,7 @@ def described(cells: LowestPoints, plane: Plane, other_height: float) -> tuple[f
     is_over = (d * inverse > CLEARLY_OFF) & (cells.z < 0.0) & is_first
     is_below = (d * inverse < -CLEARLY_OFF) & ~cells.is_alone
     # Floor at the foot of a wall lies alone.
-    is_off = np.abs(d * inverse) > 1.0
-    z = is_off * cells.lowest_z + ~is_off * cells.z
+    z = np.where(np.abs(d * inverse) > 1.0, cells.lowest_z, cells.z)
     d = distance(cells.x, cells.y, z, plane)
     is_on = np.abs(d * inverse) <= 1.0
     n = int(np.count_nonzero(is_on))
