@@ -77,14 +77,14 @@ def main_managed() -> int:
 
 def run_warm_up(_arguments: argparse.Namespace) -> int:
     """Compile all code that a frame needs."""
-    from gp_ground_seg.core.jit import HAVE_NUMBA, code_folder
+    from gp_ground_seg.core.jit import DURATION, HAVE_NUMBA, code_folder
     from gp_ground_seg.ros.loader import compile_all
 
     if not HAVE_NUMBA:
         raise errors.MissingDependencyError(
             f'numba is not installed, nothing to compile: {errors.install_hint("numba")}'
         )
-    errors.LOGGER.info('compiling what is not on disk yet: 30 to 90 s for all of it')
+    errors.LOGGER.info(f'compiling what is not on disk yet: {DURATION} for all of it')
     begin = time.monotonic()
     compile_all()
     seconds, folder = time.monotonic() - begin, code_folder()

@@ -26,6 +26,8 @@ import numpy as np
 
 from gp_ground_seg.core.errors import log_once
 
+DURATION = 'one to two minutes'  # of compiling all, in one process or two
+
 # Ubuntu 24.04 has no package of numba. Its import takes most of a second: it waits until something
 # is to be compiled.
 HAVE_NUMBA = importlib.util.find_spec('numba') is not None
@@ -170,7 +172,7 @@ class _CodeFile:
             self._begin_turn()
             if (code := self._read().get(key)) is None:
                 log_once(
-                    logging.WARNING, 'compiling once for this processor, which takes 30 to 90 s'
+                    logging.WARNING, f'compiling once for this processor, which takes {DURATION}'
                 )
                 return None
             self._end_turn()  # another process has compiled it meanwhile
@@ -234,7 +236,7 @@ def _list(path: Path) -> None:
 def _log_not_kept(reason: object) -> None:
     log_once(
         logging.WARNING,
-        'compiled code is not kept on disk (%s): every start compiles, which takes 30 to 90 s; '
+        f'compiled code is not kept on disk (%s): every start compiles, which takes {DURATION}; '
         'set NUMBA_CACHE_DIR to a folder of your own',
         reason,
     )

@@ -11,14 +11,13 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from gp_ground_seg.core.jit import DURATION
 from gp_ground_seg.core.parameters.config import Config
 
 if TYPE_CHECKING:
     from gp_ground_seg.core.backend import Backend
 
-FOLLOWS = (
-    'segmenting with numpy until the compiled code is there: a second, or 30 to 90 s to compile it'
-)
+FOLLOWS = f'segmenting with numpy until compiled code is there: a second, or {DURATION} to compile'
 CHANGED = 'segmenting with numba now'
 STAYS = 'segmenting with numpy from now on'
 JOIN_TIMEOUT = 0.5  # longest wait for the thread [s]
@@ -99,8 +98,7 @@ class BackendLoader(threading.Thread):
     def close(self) -> None:
         """End the compiling process, and wait for the thread; `on_done` is not called any more.
 
-        Not for one that compiles in this process, where no folder can keep the code: that takes
-        30 to 90 s.
+        Not for one that compiles in this process, where no folder can keep the code.
         """
         with self._lock:
             self._is_closed = True

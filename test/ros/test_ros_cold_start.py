@@ -97,5 +97,5 @@ def test_warm_up_command_says_where_the_code_is(capsys):
     said = capsys.readouterr()
     assert said.out.startswith(f'compiled code is kept in {code_folder()}; it was there after ')
     assert said.err.startswith(
-        'gp-ground-seg: note: compiling what is not on disk yet: 30 to 90 s'
+        'gp-ground-seg: note: compiling what is not on disk yet: one to two minutes'
     )
