@@ -55,9 +55,8 @@ class NumbaBackend:
         n_segments, n_bins = config.grid.n_segments, len(geometry.edges) - 1
         cell, tile = np.empty(n_points, np.int32), np.empty(n_points, np.int32)
         grid = PolarGrid(cell, np.empty(n_points, dtype), geometry.edges, n_segments)
-        n_places = geometry.n_sides**2
-        n = min(n_points, n_places)
-        at = np.full(n_places, OUTSIDE, np.int32)
+        at = np.full(geometry.n_sides**2, OUTSIDE, np.int32)
+        n = min(n_points, len(at))
         tiles = Tiles(tile, np.empty((n, 2), dtype), np.empty(n, np.int32), at)
         candidates = Candidates.buffers(n_segments * n_bins, n_segments)
         extent, least = np.empty(n_segments * n_bins), config.lines.min_density_extent

@@ -216,8 +216,7 @@ def _take_candidates(
     Returns the number of candidates. `edges` and `min_extent` are those of `ground_candidates`
     of the twin.
     """
-    n_bins = len(edges) - 1
-    c = 0
+    n_bins, c = len(edges) - 1, 0
     for m in range(len(candidates.offsets) - 1):
         candidates.offsets[m] = c
         for n in range(n_bins):

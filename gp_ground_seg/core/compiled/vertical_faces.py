@@ -79,7 +79,10 @@ def _mark_scattered(
     label: LabelConfig,
     faces: Faces,
 ) -> None:
-    """Mark raised tiles about which many scatter, by the sums (K, SUMS) of those to examine."""
+    """Mark raised tiles about which many scatter, by the sums (K, SUMS) of those to examine.
+
+    The first rows of `sums` become those of the raised tiles.
+    """
     n, n_own, face, n_sides = 0, 0, face_height(label), int(math.sqrt(len(tiles.at)))
     raised, own, square = np.empty_like(tall), np.empty(len(tall)), np.empty(len(tall))
     for k in range(len(tall)):
@@ -88,16 +91,17 @@ def _mark_scattered(
         if faces.is_face[t]:
             continue
         if low + height > 0.5 * face:
-            raised[n], square[n] = k, scatter_square(sums[k])
+            raised[n], square[n] = t, scatter_square(sums[k])
+            for i in range(np.uintp(SUMS)):
+                sums[n, i] = sums[k, i]
             n += 1
         elif low + height > -0.5 * face and high - low <= face:
             own[n_own] = scatter_square(sums[k])
             n_own += 1
     _, counts = levels_of(own[:n_own], SQUARE_SCATTERS)
     limit = smooth_up_to(SCATTER[level_at(counts, counts.sum(), OWN_SHARE)])
-    sums, raised, level = sums[raised[:n]], tall[raised[:n]], np.empty(n, np.int32)
-    place = tiles.place[raised]
-    block, places, blocks, small = _merged(place, n_sides, sums)
+    place, level = tiles.place[raised[:n]], np.empty(n, np.int32)
+    block, places, blocks, small = _merged(place, n_sides, sums[:n])
     wide_block, _, _, large = _merged(places, (n_sides + 1) // 2, blocks)
     for k in range(n):
         b = np.uintp(block[k])
@@ -120,18 +124,17 @@ def _merged(
     """
     width, n = (n_sides + 1) // 2, 0
     number, block, places = np.zeros(width * width, np.int32), np.empty_like(place), place.copy()
-    blocks, square = np.empty_like(sums), np.empty(len(sums))
+    blocks, square = np.zeros_like(sums), np.empty(len(sums))
     for k in range(len(place)):
         # A division of whole numbers takes longer.
         column = np.int32((place[k] + 0.5) / n_sides)
         at = np.uintp((column >> 1) * width + (place[k] - column * n_sides >> 1))
         if number[at] == 0:
-            places[n], blocks[n] = at, 0.0
+            places[n], number[at] = at, n + 1
             n += 1
-            number[at] = n
-        block[k] = number[at] - 1
-        for i in range(SUMS):
-            blocks[block[k], i] += sums[k, i]
+        block[k] = own = np.uintp(number[at] - 1)
+        for i in range(np.uintp(SUMS)):
+            blocks[own, i] += sums[k, i]
     for b in range(n):
         square[b] = slope_square(blocks[b])
     return block, places[:n], blocks[:n], square

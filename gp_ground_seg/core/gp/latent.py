@@ -85,10 +85,11 @@ def given_log_length_scales(
     One constant, or those of the lines: linear between the candidates. Arbitrary ones, to be set,
     where the model is the latent process.
     """
-    candidates, knots, n_knots = frame.candidates, frame.knots, n_wanted_knots(frame)
-    at_knots = np.full((len(n_knots), len(knots)), np.nan)
+    candidates, knots = frame.candidates, frame.knots
+    at_knots = np.full((candidates.n_segments, len(knots)), np.nan)
     if length_scale.model == 'latent':
         return np.empty(len(candidates.r)), at_knots
+    n_knots = n_wanted_knots(frame)
     if length_scale.model == 'constant':
         u = np.full(len(candidates.r), np.log(length_scale.constant))
     else:

@@ -137,12 +137,13 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
     if is_crossed.mean() < MIRRORED:
         return 0.0
     # Boxes with a return, and a margin of one on all sides.
-    low = raised.min(axis=0) - 2.0 * COUNTERPART
-    shape = ((raised.max(axis=0) - low) / COUNTERPART).astype(np.int64) + 3
-    box = (scan.xyz[plane.below(*scan.xyz.T) > DEEP] - low) / COUNTERPART
-    box = box[((box > 0.0) & (box < shape)).all(axis=1)].astype(np.int64)
-    has_return = np.zeros(shape, dtype=np.bool_)
-    has_return[tuple(box.T)] = True
+    low, high = raised.min(axis=0) - 2.0 * COUNTERPART, raised.max(axis=0) + 2.0 * COUNTERPART
+    is_about = plane.below(*scan.xyz.T) > DEEP
+    for values, first, last in zip(scan.xyz.T, low, high, strict=True):
+        is_about &= (values > first) & (values < last)
+    box = ((scan.xyz.T[:, is_about] - low[:, None]) / COUNTERPART).astype(np.int64)
+    has_return = np.zeros(((high - low) / COUNTERPART).astype(np.int64) + 1, dtype=np.bool_)
+    has_return[tuple(box)] = True
     around = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 1, 3)
     boxes = ((raised - low) / COUNTERPART).astype(np.int64) + around
     return float(np.mean(is_crossed & has_return[tuple(boxes.T)].any(axis=1)))

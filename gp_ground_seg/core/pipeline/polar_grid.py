@@ -258,19 +258,10 @@ def ground_candidates(
     For `extremes` and `numbers` see `reduce_cells`; `edges`, (n_bins + 1,), are the ranges of the
     bin edges [m]. For `min_extent` see `vertical_density`.
     """
-    n_bins = len(edges) - 1
-    occupied = np.flatnonzero(numbers[:, 0])
+    n_bins, occupied = len(edges) - 1, np.flatnonzero(numbers[:, 0])
     bins = occupied % n_bins
-    lowest_z, lowest_r, highest_z, x, y = extremes[occupied].astype(np.float64).T
-    widths = np.diff(edges)[bins]
-    per_segment = np.bincount(occupied // n_bins, minlength=len(numbers) // n_bins)
-    return Candidates(
-        r=lowest_r.copy(),
-        z=lowest_z.copy(),
-        bin=bins,
-        density=vertical_density(numbers[occupied, 0], widths, lowest_z, highest_z, min_extent),
-        offsets=np.concatenate([[0], np.cumsum(per_segment)]),
-        tile=numbers[occupied, 1],
-        x=x.copy(),
-        y=y.copy(),
-    )
+    z, r, highest_z, x, y = extremes[occupied].T.astype(np.float64, order='C')
+    number, tile = numbers[occupied].T.copy()
+    density = vertical_density(number, np.diff(edges)[bins], z, highest_z, min_extent)
+    offsets = np.searchsorted(occupied, np.arange(0, len(numbers) + 1, n_bins))
+    return Candidates(r, z, bins, density, offsets, tile, x, y)

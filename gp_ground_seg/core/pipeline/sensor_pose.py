@@ -83,7 +83,7 @@ class SensorPose:
     #: place of the sensor in the frame of the cloud, if it was given [m]
     origin: Direction = (0.0, 0.0, 0.0)
 
-    @property
+    @cached_property
     def sensor_height(self) -> float:
         """Height of the sensor above the ground near it, along the vertical [m]."""
         return self.height + float(self.rotation[2] @ self.origin)
