@@ -138,12 +138,12 @@ def mirror_share(plane: GroundPlane, scan: Scan) -> float:
         return 0.0
     # Boxes with a return, and a margin of one on all sides.
     low, high = raised.min(axis=0) - 2.0 * COUNTERPART, raised.max(axis=0) + 2.0 * COUNTERPART
-    is_about = plane.below(*scan.xyz.T) > DEEP
+    about = np.flatnonzero(plane.below(*scan.xyz.T) > DEEP)
     for values, first, last in zip(scan.xyz.T, low, high, strict=True):
-        is_about &= (values > first) & (values < last)
-    box = ((scan.xyz.T[:, is_about] - low[:, None]) / COUNTERPART).astype(np.int64)
+        about = about[(values[about] > first) & (values[about] < last)]
+    box = (scan.xyz.T.take(about, axis=1) - low[:, None]) / COUNTERPART
     has_return = np.zeros(((high - low) / COUNTERPART).astype(np.int64) + 1, dtype=np.bool_)
-    has_return[tuple(box)] = True
+    has_return[tuple(box.astype(np.int64))] = True
     around = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 1, 3)
     boxes = ((raised - low) / COUNTERPART).astype(np.int64) + around
     return float(np.mean(is_crossed & has_return[tuple(boxes.T)].any(axis=1)))
