@@ -12,6 +12,7 @@ from gp_ground_seg.core.frame import (
     Frame,
     GroundSurface,
     IntArray,
+    PointArray,
     Values,
 )
 from gp_ground_seg.core.gp.evidence import (
@@ -26,7 +27,6 @@ from gp_ground_seg.core.gp.evidence import (
 )
 from gp_ground_seg.core.gp.kernels import (
     Padded,
-    add_noise,
     batches,
     line_covariance,
     line_variances,
@@ -248,7 +248,9 @@ def grow_inliers(
     certain, beside = noise_among(found.alike, gate_noise), at_candidates(from_neighbours, frame)
     above = contradicts(*beside, z, gate_noise) & ~frame.land
     noise, is_own = certain.copy(), segment % step == 0
-    blocks = _prior_blocks(frame, found.log_length_scale, sill, model.observation, step)
+    values, tables, top, own = _prior_tables(
+        frame, found.log_length_scale, sill, model.observation, step
+    )
     height, variance = np.zeros(len(z)), prior_variance(sill, model.observation, candidates.r)
     predicted, stops = combined(height, variance, *beside), frame.in_face | above
     chosen[:], joining = False, found.seed & ~above & is_own
@@ -259,10 +261,8 @@ def grow_inliers(
                 of_these = (values[in_doubt] for values in (z, *predicted, noise, frame.in_face))
                 noise[in_doubt] = noise_in_doubt(*of_these)
             chosen |= joining
-            for layout, table in blocks:
-                if joining[layout.place].any():
-                    which, given, spread = _condition(layout, table, joining, noise)
-                    height[which], variance[which] = z[which] - given, spread
+            _observe(candidates.offsets, tables, joining, noise)
+            height, variance = z - values[top], values[own].astype(np.float64)
             predicted = combined(height, variance, *beside)
             fitting = fits(z, *predicted, gate_noise, growth)
             on_slope, is_shown = _on_slope(frame, chosen, fitting, stops, growth)
@@ -309,47 +309,76 @@ def carries_on(rise: Values, distance: Values, onward: Values, land: Values) -> 
     return (rise > 0.0) & (land | (RISES_ON * rise <= onward * distance))
 
 
-def _prior_blocks(
+def _prior_tables(
     frame: Frame, u: FloatArray, sill: float, observation: ObservationConfig, step: int
-) -> list[tuple[Padded, FloatArray]]:
-    """Prior of every `step`-th segment by log length-scales `u` (C,), in blocks of S segments.
+) -> tuple[FloatArray, list[FloatArray], IntArray, IntArray]:
+    """Prior of every `step`-th segment by log length-scales `u` (C,), in single precision.
 
-    A table, (S, n, n + 1), has the covariance of their heights, and then their residuals, which
-    are those given the inliers so far; in single precision.
+    The table of a segment, (1 + n, 1 + n), has a row and a column with the residuals of its n
+    candidates, and then the covariance of their heights. Returns the values of all tables, and the
+    tables as views of them, those of other segments are 0; and for each candidate the places of
+    its residual and of its variance among the values, two (C,).
     """
-    candidates, blocks = frame.candidates, []
+    candidates, segment = frame.candidates, frame.candidates.segment
     z = np.clip(candidates.z - frame.prior_mean, -FARTHEST, FARTHEST)
+    size = np.diff(candidates.offsets) + 1
+    start = np.cumsum(size * size) - size * size
+    values = np.zeros((size * size).sum(), np.float32)
+    tables = [
+        values[first : first + n * n].reshape(n, n)
+        for first, n in zip(start.tolist(), size.tolist(), strict=True)
+    ]
     for segments in batches(np.arange(0, candidates.n_segments, step), candidates.offsets):
         layout = Padded.of(segments, candidates.offsets)
-        columns = (layout.take(values)[:, None] for values in (candidates.r, u, z))
-        r, own_u, residual = (values.astype(np.float32) for values in columns)
-        own_r, l = r.swapaxes(1, 2), np.exp(own_u)  # noqa: E741
-        covariance = paciorek(own_r, l.swapaxes(1, 2), r, l, sill)
-        covariance += line_covariance(own_r, r, *line_variances(observation))
-        blocks.append((layout, np.concatenate([covariance, residual.swapaxes(1, 2)], axis=2)))
-    return blocks
+        r, own_u, residual = (
+            layout.take(column).astype(np.float32) for column in (candidates.r, u, z)
+        )
+        places = r, np.exp(own_u)
+        prior = _prior(places, places, sill, observation)
+        for m, own_z, covariance in zip(segments.tolist(), residual, prior, strict=True):
+            table, n = tables[m], len(tables[m]) - 1
+            table[0, 1:] = table[1:, 0] = own_z[:n]
+            table[1:, 1:] = covariance[:n, :n]
+    rank = np.arange(1, len(u) + 1) - candidates.offsets[segment]
+    top = start[segment] + rank
+    return values, tables, top, top + rank * size[segment]
 
 
-def _condition(
-    layout: Padded, table: FloatArray, new: BoolArray, noise: FloatArray
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Change the table of a block by observing those that are `new`, with `noise` (C,).
+def _observe(
+    offsets: IntArray, tables: list[FloatArray], new: BoolArray, noise: FloatArray
+) -> None:
+    """Change the tables by observing the candidates that are `new`, with `noise`, two (C,).
 
-    Returns candidates of their segments, (P,), with residual and variance.
+    Segment by segment: batches of these small matrices would be mostly padding.
     """
-    is_new = new[layout.place] & layout.mask
-    own = np.flatnonzero(is_new.any(axis=1))
-    # Places of the new ones, first in each row; the rest is padding.
-    is_new, n_new = is_new[own], is_new[own].sum(axis=1)[:, None]
-    place, mask = layout.place[own], layout.mask[own]
-    at = np.argsort(~is_new, axis=1, kind='stable')[:, : n_new.max(initial=0)]
-    is_new, observed = np.arange(at.shape[1]) < n_new, np.take_along_axis(place, at, axis=1)
-    rows = table[own[:, None], at]
-    within = add_noise(np.take_along_axis(rows, at[:, None], axis=2), noise[observed], is_new)
-    rows = whitened(within, rows, is_new)
-    given = table[own] - np.matmul(rows[:, :, :-1].swapaxes(1, 2), rows)
-    table[own] = given
-    return place[mask], given[:, :, -1][mask], np.einsum('sii->si', given[:, :, :-1])[mask]
+    which = np.flatnonzero(new)
+    bounds = np.searchsorted(which, offsets)
+    column = which + 1 - np.repeat(offsets[:-1], np.diff(bounds))
+    added = noise[which].astype(np.float32)
+    for m in np.flatnonzero(np.diff(bounds)).tolist():
+        table, own = tables[m], slice(bounds[m], bounds[m + 1])
+        rows = table.take(column[own], axis=0)
+        within = rows.take(column[own], axis=1)
+        within.ravel()[:: len(within) + 1] += added[own]
+        rows = whitened(within, rows)
+        table -= rows.T @ rows
+
+
+def _prior(
+    places: tuple[PointArray, PointArray],
+    others: tuple[PointArray, PointArray],
+    sill: float,
+    observation: ObservationConfig,
+) -> FloatArray:
+    """Prior covariance of heights at places (S, n) and at others (S, k), (S, n, k) [m^2].
+
+    Places are their ranges and length-scales.
+    """
+    (r_a, l_a), (r_b, l_b) = places, others
+    r_a, r_b = r_a[:, :, None], r_b[:, None]
+    covariance: FloatArray = paciorek(r_a, l_a[:, :, None], r_b, l_b[:, None], sill)
+    covariance += line_covariance(r_a, r_b, *line_variances(observation))
+    return covariance
 
 
 def regress(
@@ -364,7 +393,6 @@ def regress(
     which = np.flatnonzero(found.inlier)
     segments = np.arange(0, candidates.n_segments, step)
     sill, noise = variances_of(frame, theta, observation, ROUNDING)
-    line = line_variances(observation)
     noise = (noise_among(found.alike, noise) + found.doubt)[which]
     r, z = candidates.r[which], candidates.z[which] - frame.prior_mean
     length_scale = np.exp(found.log_length_scale[which])
@@ -372,18 +400,18 @@ def regress(
     found.mean[segments] = found.std[segments] = np.nan
     for own in batches(segments, offsets):
         layout = Padded.of(own, offsets)
-        own_r, own_l = layout.take(r)[:, :, None], layout.take(length_scale, 1.0)[:, :, None]
+        places = layout.take(r), layout.take(length_scale, 1.0)
         is_wanted = np.isfinite(knot_u[own])
         n_knots = int(is_wanted.sum(axis=1).max())
         is_wanted, knots = is_wanted[:, :n_knots], frame.knots[:n_knots]
-        knot_l = np.where(is_wanted, np.exp(knot_u[own, :n_knots]), 1.0)[:, None]
-        within = paciorek(own_r, own_l, own_r.swapaxes(1, 2), own_l.swapaxes(1, 2), sill)
-        within += line_covariance(own_r, own_r.swapaxes(1, 2), *line)
-        add_noise(within, layout.take(noise), layout.mask)
-        rows = paciorek(own_r, own_l, knots, knot_l, sill) + line_covariance(own_r, knots, *line)
-        rows = whitened(
-            within, np.concatenate([rows, layout.take(z)[:, :, None]], axis=2), layout.mask
-        )
+        knot_l = np.where(is_wanted, np.exp(knot_u[own, :n_knots]), 1.0)
+        within = _prior(places, places, sill, observation)
+        np.einsum('sii->si', within)[:] += layout.take(noise)
+        rows = _prior(places, (knots[None], knot_l), sill, observation)
+        rows = np.concatenate([rows, layout.take(z)[:, :, None]], axis=2)
+        for own_rows, covariance, n in zip(rows, within, layout.mask.sum(axis=1), strict=True):
+            own_rows[:n] = whitened(covariance[:n, :n], own_rows[:n])
+            own_rows[n:] = 0.0
         rows, own_z = rows[:, :, :-1], rows[:, :, -1:]
         height = np.matmul(own_z.swapaxes(1, 2), rows)[:, 0]
         variance = prior_variance(sill, observation, knots) - np.einsum('sij,sij->sj', rows, rows)
