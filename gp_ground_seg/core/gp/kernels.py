@@ -121,11 +121,13 @@ def batches(segments: IntArray, offsets: IntArray) -> list[IntArray]:
 def whitened(covariance: FloatArray, rows: FloatArray) -> FloatArray:
     """Solve ``L X = rows`` for the Cholesky factor L of a covariance (n, n), and rows (n, k).
 
-    Rows that are contiguous are overwritten.
+    NaN where it is not positive definite. Rows that are contiguous are overwritten.
     """
     factorise, solve = _solvers(rows.dtype)
     # LAPACK takes arrays by columns: to it ours are transposed.
-    factor, _ = factorise(covariance.T)
+    factor, is_failed = factorise(covariance.T)
+    if is_failed:
+        return np.full_like(rows, np.nan)
     result: FloatArray = solve(1.0, factor, rows.T, side=1, overwrite_b=True).T
     return result
 
@@ -143,12 +145,8 @@ def inverted(covariance: FloatArray) -> tuple[FloatArray, float]:
 
     NaN where it is not positive definite. Compiled code reads, and overwrites, its upper triangle.
     """
-    try:
-        factor = np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        return np.full_like(covariance, np.nan), np.nan
-    inverse: Any = np.linalg.inv(covariance)
-    return inverse, float(np.log(np.diagonal(factor)).sum())
+    root = whitened(covariance, np.eye(len(covariance)))
+    return root.T @ root, -float(np.log(np.diagonal(root)).sum())
 
 
 @functools.cache
