@@ -248,9 +248,8 @@ def grow_inliers(
     certain, beside = noise_among(found.alike, gate_noise), at_candidates(from_neighbours, frame)
     above = contradicts(*beside, z, gate_noise) & ~frame.land
     noise, is_own = certain.copy(), segment % step == 0
-    values, tables, top, own = _prior_tables(
-        frame, found.log_length_scale, sill, model.observation, step
-    )
+    tables = _prior_tables(frame, found.log_length_scale, sill, model.observation, step)
+    rank = np.arange(1, len(z) + 1) - candidates.offsets[segment]
     height, variance = np.zeros(len(z)), prior_variance(sill, model.observation, candidates.r)
     predicted, stops = combined(height, variance, *beside), frame.in_face | above
     chosen[:], joining = False, found.seed & ~above & is_own
@@ -261,8 +260,9 @@ def grow_inliers(
                 of_these = (values[in_doubt] for values in (z, *predicted, noise, frame.in_face))
                 noise[in_doubt] = noise_in_doubt(*of_these)
             chosen |= joining
-            _observe(candidates.offsets, tables, joining, noise)
-            height, variance = z - values[top], values[own].astype(np.float64)
+            _observe(tables, candidates.offsets, joining, noise)
+            height = z - tables[segment, 0, rank]
+            variance = tables[segment, rank, rank].astype(np.float64)
             predicted = combined(height, variance, *beside)
             fitting = fits(z, *predicted, gate_noise, growth)
             on_slope, is_shown = _on_slope(frame, chosen, fitting, stops, growth)
@@ -311,55 +311,37 @@ def carries_on(rise: Values, distance: Values, onward: Values, land: Values) -> 
 
 def _prior_tables(
     frame: Frame, u: FloatArray, sill: float, observation: ObservationConfig, step: int
-) -> tuple[FloatArray, list[FloatArray], IntArray, IntArray]:
-    """Prior of every `step`-th segment by log length-scales `u` (C,), in single precision.
+) -> PointArray:
+    """Prior of every `step`-th segment by log length-scales `u` (C,); the others are 0.
 
-    The table of a segment, (1 + n, 1 + n), has a row and a column with the residuals of its n
-    candidates, and then the covariance of their heights. Returns the values of all tables, and the
-    tables as views of them, those of other segments are 0; and for each candidate the places of
-    its residual and of its variance among the values, two (C,).
+    The table of a segment has a row and a column with the residuals of its candidates, and then
+    the covariance of their heights. In single precision, (M, 1 + n, 1 + n) for at most n.
     """
-    candidates, segment = frame.candidates, frame.candidates.segment
+    candidates = frame.candidates
     z = np.clip(candidates.z - frame.prior_mean, -FARTHEST, FARTHEST)
-    size = np.diff(candidates.offsets) + 1
-    start = np.cumsum(size * size) - size * size
-    values = np.zeros((size * size).sum(), np.float32)
-    tables = [
-        values[first : first + n * n].reshape(n, n)
-        for first, n in zip(start.tolist(), size.tolist(), strict=True)
-    ]
+    width = 1 + np.diff(candidates.offsets).max(initial=0)
+    tables = np.zeros((candidates.n_segments, width, width), np.float32)
     for segments in batches(np.arange(0, candidates.n_segments, step), candidates.offsets):
         layout = Padded.of(segments, candidates.offsets)
-        r, own_u, residual = (
-            layout.take(column).astype(np.float32) for column in (candidates.r, u, z)
-        )
-        places = r, np.exp(own_u)
-        prior = _prior(places, places, sill, observation)
-        for m, own_z, covariance in zip(segments.tolist(), residual, prior, strict=True):
-            table, n = tables[m], len(tables[m]) - 1
-            table[0, 1:] = table[1:, 0] = own_z[:n]
-            table[1:, 1:] = covariance[:n, :n]
-    rank = np.arange(1, len(u) + 1) - candidates.offsets[segment]
-    top = start[segment] + rank
-    return values, tables, top, top + rank * size[segment]
+        columns = (layout.take(values).astype(np.float32) for values in (candidates.r, u, z))
+        r, own_u, residual = columns
+        places, own = (r, np.exp(own_u)), slice(1, 1 + r.shape[1])
+        tables[segments, 0, own] = tables[segments, own, 0] = residual
+        tables[segments, own, own] = _prior(places, places, sill, observation)
+    return tables
 
 
-def _observe(
-    offsets: IntArray, tables: list[FloatArray], new: BoolArray, noise: FloatArray
-) -> None:
-    """Change the tables by observing the candidates that are `new`, with `noise`, two (C,).
-
-    Segment by segment: batches of these small matrices would be mostly padding.
-    """
-    which = np.flatnonzero(new)
+def _observe(tables: PointArray, offsets: IntArray, new: BoolArray, noise: FloatArray) -> None:
+    """Change the tables by observing the candidates that are `new`, with `noise`, two (C,)."""
+    which, size = np.flatnonzero(new), 1 + np.diff(offsets)
     bounds = np.searchsorted(which, offsets)
     column = which + 1 - np.repeat(offsets[:-1], np.diff(bounds))
-    added = noise[which].astype(np.float32)
-    for m in np.flatnonzero(np.diff(bounds)).tolist():
-        table, own = tables[m], slice(bounds[m], bounds[m + 1])
+    # One by one: a batch of small matrices is mostly padding.
+    for m in np.flatnonzero(np.diff(bounds)):
+        table, own = tables[m, : size[m], : size[m]], slice(bounds[m], bounds[m + 1])
         rows = table.take(column[own], axis=0)
         within = rows.take(column[own], axis=1)
-        within.ravel()[:: len(within) + 1] += added[own]
+        within.ravel()[:: len(within) + 1] += noise[which[own]]
         rows = whitened(within, rows)
         table -= rows.T @ rows
 
@@ -370,10 +352,7 @@ def _prior(
     sill: float,
     observation: ObservationConfig,
 ) -> FloatArray:
-    """Prior covariance of heights at places (S, n) and at others (S, k), (S, n, k) [m^2].
-
-    Places are their ranges and length-scales.
-    """
+    """Prior covariance of heights at ranges with length-scales, (S, n) and (S, k) [m^2]."""
     (r_a, l_a), (r_b, l_b) = places, others
     r_a, r_b = r_a[:, :, None], r_b[:, None]
     covariance: FloatArray = paciorek(r_a, l_a[:, :, None], r_b, l_b[:, None], sill)
@@ -401,10 +380,9 @@ def regress(
     for own in batches(segments, offsets):
         layout = Padded.of(own, offsets)
         places = layout.take(r), layout.take(length_scale, 1.0)
-        is_wanted = np.isfinite(knot_u[own])
-        n_knots = int(is_wanted.sum(axis=1).max())
-        is_wanted, knots = is_wanted[:, :n_knots], frame.knots[:n_knots]
-        knot_l = np.where(is_wanted, np.exp(knot_u[own, :n_knots]), 1.0)
+        # NaN behind the last knot that is wanted, and so is what follows there.
+        n_knots = int(np.isfinite(knot_u[own]).sum(axis=1).max())
+        knots, knot_l = frame.knots[:n_knots], np.exp(knot_u[own, :n_knots])
         within = _prior(places, places, sill, observation)
         np.einsum('sii->si', within)[:] += layout.take(noise)
         rows = _prior(places, (knots[None], knot_l), sill, observation)
@@ -413,7 +391,6 @@ def regress(
             own_rows[:n] = whitened(covariance[:n, :n], own_rows[:n])
             own_rows[n:] = 0.0
         rows, own_z = rows[:, :, :-1], rows[:, :, -1:]
-        height = np.matmul(own_z.swapaxes(1, 2), rows)[:, 0]
         variance = prior_variance(sill, observation, knots) - np.einsum('sij,sij->sj', rows, rows)
-        found.mean[own, :n_knots] = np.where(is_wanted, height, np.nan)
-        found.std[own, :n_knots] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+        found.mean[own, :n_knots] = np.matmul(own_z.swapaxes(1, 2), rows)[:, 0]
+        found.std[own, :n_knots] = np.sqrt(np.maximum(variance, 0.0))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, Values
+from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, PointArray, Values
 from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import ObservationConfig
 
@@ -22,7 +22,7 @@ except ImportError:  # then BLAS keeps its threads
 LARGEST_EXPONENT = 40.0
 """Largest x of which ``exp(-x)`` is computed: 4e-18, as good as nothing. Squares of less lose
 digits in single precision, and take numpy tens of times as long."""
-SEGMENTS_PER_BATCH = 32
+SEGMENTS_PER_BATCH = 24
 """Larger batches waste room on padding and leave the processor's cache; smaller ones cost
 calls."""
 
@@ -118,7 +118,7 @@ def batches(segments: IntArray, offsets: IntArray) -> list[IntArray]:
     return np.array_split(order, n_batches) if n_batches else []
 
 
-def whitened(covariance: FloatArray, rows: FloatArray) -> FloatArray:
+def whitened(covariance: PointArray, rows: PointArray) -> PointArray:
     """Solve ``L X = rows`` for the Cholesky factor L of a covariance (n, n), and rows (n, k).
 
     NaN where it is not positive definite. Rows that are contiguous are overwritten.
@@ -128,7 +128,7 @@ def whitened(covariance: FloatArray, rows: FloatArray) -> FloatArray:
     factor, is_failed = factorise(covariance.T)
     if is_failed:
         return np.full_like(rows, np.nan)
-    result: FloatArray = solve(1.0, factor, rows.T, side=1, overwrite_b=True).T
+    result: PointArray = solve(1.0, factor, rows.T, side=1, overwrite_b=True).T
     return result
 
 

@@ -171,10 +171,7 @@ def _in_front(candidates: Candidates, near: IntArray) -> BoolArray:
 
 
 def _groups(n: int, first: IntArray, second: IntArray) -> IntArray:
-    """Group of each of `n` members, (n,), of which those of a pair are in one group.
-
-    It is the least of its members.
-    """
+    """Least member of the group of each of `n`, (n,); the two of a pair are in one group."""
     group = np.arange(n)
     while len(first) > 0:
         a, b = group[first], group[second]

@@ -165,9 +165,9 @@ def _squares_of_blocks(place: CellArray, n_sides: int, sums: FloatArray, shift: 
     """
     column, row = np.divmod(as_index(place), n_sides)
     block = (column >> shift) * n_sides + (row >> shift)
-    blocks = np.array([np.bincount(block, total)[block] for total in sums])
-    square: FloatArray = slope_square(blocks)
-    return square
+    own = np.unique(block, return_inverse=True)[1]
+    square: FloatArray = slope_square(np.array([np.bincount(own, total) for total in sums]))
+    return square[own]
 
 
 @shared
