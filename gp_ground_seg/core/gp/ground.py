@@ -241,38 +241,38 @@ def grow_inliers(
     a candidate among others, or that joins in doubt, shows less: see `noise_among` and
     `noise_in_doubt`. Where the ground carries on to it there is no doubt.
     """
-    candidates, segment = frame.candidates, frame.candidates.segment
-    z, chosen, growth = candidates.z - frame.prior_mean, found.inlier, model.growth
     sill, gate_noise = variances_of(frame, theta, model.observation, ROUNDING_SINGLE)
-    found.alike[:] = _count_near(candidates, np.exp(theta[3]) if model.by_roughness else 0.0)
-    certain, beside = noise_among(found.alike, gate_noise), at_candidates(from_neighbours, frame)
-    above = contradicts(*beside, z, gate_noise) & ~frame.land
-    noise, is_own = certain.copy(), segment % step == 0
-    tables = _prior_tables(frame, found.log_length_scale, sill, model.observation, step)
-    rank = np.arange(1, len(z) + 1) - candidates.offsets[segment]
-    height, variance = np.zeros(len(z)), prior_variance(sill, model.observation, candidates.r)
-    predicted, stops = combined(height, variance, *beside), frame.in_face | above
-    chosen[:], joining = False, found.seed & ~above & is_own
+    grows = frame.candidates.segment % step == 0
+    of_these = {name: getattr(frame, name)[grows] for name in ('onward', 'land', 'in_face')}
+    frame = frame._replace(candidates=frame.candidates.where(grows), **of_these)
+    candidates, segment = frame.candidates, frame.candidates.segment
+    z, growth = candidates.z - frame.prior_mean, model.growth
+    alike = _count_near(candidates, np.exp(theta[3]) if model.by_roughness else 0.0)
+    certain, beside = noise_among(alike, gate_noise), at_candidates(from_neighbours, frame)
+    above, noise = contradicts(*beside, z, gate_noise) & ~frame.land, certain.copy()
+    tables = _prior_tables(frame, found.log_length_scale[grows], sill, model.observation)
+    prior, stops = prior_variance(sill, model.observation, candidates.r), frame.in_face | above
+    predicted = combined(np.zeros(len(z)), prior, *beside)
+    chosen, joining = np.zeros(len(z), np.bool_), found.seed[grows] & ~above
     in_doubt, has_inliers = joining & frame.in_face, np.zeros(candidates.n_segments, np.bool_)
     with np.errstate(over='ignore', invalid='ignore'):  # the square of 1e200 m: no fit
         while True:
             if model.by_roughness:
-                of_these = (values[in_doubt] for values in (z, *predicted, noise, frame.in_face))
-                noise[in_doubt] = noise_in_doubt(*of_these)
+                known = (values[in_doubt] for values in (z, *predicted, noise, frame.in_face))
+                noise[in_doubt] = noise_in_doubt(*known)
             chosen |= joining
-            _observe(tables, candidates.offsets, joining, noise)
-            height = z - tables[segment, 0, rank]
-            variance = tables[segment, rank, rank].astype(np.float64)
-            predicted = combined(height, variance, *beside)
+            residual, variance = _observe(tables, candidates, joining, noise)
+            predicted = combined(z - residual, variance, *beside)
             fitting = fits(z, *predicted, gate_noise, growth)
             on_slope, is_shown = _on_slope(frame, chosen, fitting, stops, growth)
             # Before anything has joined, only the evidence of neighbours decides.
             has_inliers[segment[joining]] = True
-            may_join = ~chosen & is_own & (has_inliers[segment] | (beside.precision > 0.0))
+            may_join = ~chosen & (has_inliers[segment] | (beside.precision > 0.0))
             joining, in_doubt = may_join & (fitting | on_slope), may_join & fitting & ~is_shown
             if not joining.any():
                 break
-    found.doubt[:] = noise - certain
+    found.inlier[:] = False
+    found.inlier[grows], found.alike[grows], found.doubt[grows] = chosen, alike, noise - certain
 
 
 def _on_slope(
@@ -310,9 +310,9 @@ def carries_on(rise: Values, distance: Values, onward: Values, land: Values) -> 
 
 
 def _prior_tables(
-    frame: Frame, u: FloatArray, sill: float, observation: ObservationConfig, step: int
+    frame: Frame, u: FloatArray, sill: float, observation: ObservationConfig
 ) -> PointArray:
-    """Prior of every `step`-th segment by log length-scales `u` (C,); the others are 0.
+    """Prior of every segment by log length-scales `u` (C,).
 
     The table of a segment has a row and a column with the residuals of its candidates, and then
     the covariance of their heights. In single precision, (M, 1 + n, 1 + n) for at most n.
@@ -321,7 +321,7 @@ def _prior_tables(
     z = np.clip(candidates.z - frame.prior_mean, -FARTHEST, FARTHEST)
     width = 1 + np.diff(candidates.offsets).max(initial=0)
     tables = np.zeros((candidates.n_segments, width, width), np.float32)
-    for segments in batches(np.arange(0, candidates.n_segments, step), candidates.offsets):
+    for segments in batches(np.arange(candidates.n_segments), candidates.offsets):
         layout = Padded.of(segments, candidates.offsets)
         columns = (layout.take(values).astype(np.float32) for values in (candidates.r, u, z))
         r, own_u, residual = columns
@@ -331,19 +331,22 @@ def _prior_tables(
     return tables
 
 
-def _observe(tables: PointArray, offsets: IntArray, new: BoolArray, noise: FloatArray) -> None:
-    """Change the tables by observing the candidates that are `new`, with `noise`, two (C,)."""
-    which, size = np.flatnonzero(new), 1 + np.diff(offsets)
-    bounds = np.searchsorted(which, offsets)
-    column = which + 1 - np.repeat(offsets[:-1], np.diff(bounds))
+def _observe(
+    tables: PointArray, candidates: Candidates, new: BoolArray, noise: FloatArray
+) -> tuple[PointArray, FloatArray]:
+    """Observe the candidates that are `new`, with `noise`, two (C,); residuals and variances."""
+    offsets, segment, which = candidates.offsets, candidates.segment, np.flatnonzero(new)
+    bounds, size = np.searchsorted(which, offsets), 1 + np.diff(offsets)
+    column = np.arange(1, len(new) + 1) - offsets[segment]
     # One by one: a batch of small matrices is mostly padding.
     for m in np.flatnonzero(np.diff(bounds)):
-        table, own = tables[m, : size[m], : size[m]], slice(bounds[m], bounds[m + 1])
+        table, own = tables[m, : size[m], : size[m]], which[bounds[m] : bounds[m + 1]]
         rows = table.take(column[own], axis=0)
         within = rows.take(column[own], axis=1)
-        within.ravel()[:: len(within) + 1] += noise[which[own]]
+        within.ravel()[:: len(within) + 1] += noise[own]
         rows = whitened(within, rows)
         table -= rows.T @ rows
+    return tables[segment, 0, column], tables[segment, column, column].astype(np.float64)
 
 
 def _prior(
