@@ -210,8 +210,8 @@ def _of_nearest(
     seen = deviation - distance * step
     least = np.minimum.accumulate(seen)
     nearest = np.maximum.accumulate(np.where(seen == least, distance, 0))[n - 1 : -1]
-    carried = least[n - 1 : -1] + distance[n:] * step
-    return np.take_along_axis(height, nearest, axis=0)[::side], carried[::side]
+    least = least[n - 1 : -1] + distance[n:] * step
+    return np.take_along_axis(height, nearest, axis=0)[::side], least[::side]
 
 
 def at_candidates(from_neighbours: Evidence, frame: Frame) -> Evidence:

@@ -114,6 +114,8 @@ def fit_surfaces(
     mean += frame.prior_mean
 
 
+_Places = tuple[PointArray, PointArray]  # ranges, and length-scales there [m]
+
 OBSTACLE_DEPTH = 1.0
 """Height over which the lowest returns of obstacles are spread [m]."""
 ODDS, ODDS_IN_FACE = 0.25, 4.0
@@ -349,16 +351,10 @@ def _observe(
     return tables[segment, 0, column], tables[segment, column, column].astype(np.float64)
 
 
-def _prior(
-    places: tuple[PointArray, PointArray],
-    others: tuple[PointArray, PointArray],
-    sill: float,
-    observation: ObservationConfig,
-) -> FloatArray:
+def _prior(a: _Places, b: _Places, sill: float, observation: ObservationConfig) -> PointArray:
     """Prior covariance of heights at ranges with length-scales, (S, n) and (S, k) [m^2]."""
-    (r_a, l_a), (r_b, l_b) = places, others
-    r_a, r_b = r_a[:, :, None], r_b[:, None]
-    covariance: FloatArray = paciorek(r_a, l_a[:, :, None], r_b, l_b[:, None], sill)
+    r_a, r_b = a[0][:, :, None], b[0][:, None]
+    covariance: PointArray = paciorek(r_a, a[1][:, :, None], r_b, b[1][:, None], sill)
     covariance += line_covariance(r_a, r_b, *line_variances(observation))
     return covariance
 
@@ -373,14 +369,13 @@ def regress(
     """Surface of every `step`-th segment by its own inliers and `theta`, into `found`."""
     candidates, knot_u = frame.candidates, found.knot_log_length_scale
     which = np.flatnonzero(found.inlier)
-    segments = np.arange(0, candidates.n_segments, step)
     sill, noise = variances_of(frame, theta, observation, ROUNDING)
     noise = (noise_among(found.alike, noise) + found.doubt)[which]
     r, z = candidates.r[which], candidates.z[which] - frame.prior_mean
     length_scale = np.exp(found.log_length_scale[which])
     offsets = np.searchsorted(which, candidates.offsets)
-    found.mean[segments] = found.std[segments] = np.nan
-    for own in batches(segments, offsets):
+    found.mean[::step] = found.std[::step] = np.nan
+    for own in batches(np.arange(0, candidates.n_segments, step), offsets):
         layout = Padded.of(own, offsets)
         places = layout.take(r), layout.take(length_scale, 1.0)
         # NaN behind the last knot that is wanted, and so is what follows there.

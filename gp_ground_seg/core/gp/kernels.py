@@ -32,6 +32,11 @@ def exp_neg(x: Values) -> Values:
     return np.exp(-np.minimum(x, LARGEST_EXPONENT))
 
 
+def nearer_first(r_a: Values, r_b: Values) -> tuple[Values, Values]:
+    """Both ranges, the nearer one first; a choice between numbers in compiled code."""
+    return np.minimum(r_a, r_b), np.maximum(r_a, r_b)
+
+
 @shared
 def paciorek(r_a: Values, l_a: Values, r_b: Values, l_b: Values, variance: Values) -> Values:
     """Non-stationary covariance of Paciorek and Schervish in one dimension (paper, eq. 8) [m^2].
@@ -67,13 +72,10 @@ def line_covariance(r_a: Values, r_b: Values, slope: Values, sixth: Values) -> V
     The line leaves the sensor's base with a slope of variance `slope`, and its slope walks: that
     adds ``drift^2 r^2 (3 r' - r) / 6``, with r the nearer range (an integrated Wiener process).
     `sixth` is ``drift^2 / 6`` [1/m], where ``drift^2`` is the variance that the slope gains over a
-    metre. With r the farther one that is less, by ``drift^2 (r - r')^3 / 6``.
+    metre.
     """
-    half = sixth + sixth + sixth
-    return np.maximum(
-        r_a * (slope + half * r_a) * r_b - sixth * r_a * r_a * r_a,
-        r_b * (slope + half * r_b) * r_a - sixth * r_b * r_b * r_b,
-    )
+    near, far = nearer_first(r_a, r_b)
+    return near * (slope * far + sixth * near * (far + far + far - near))
 
 
 @shared

@@ -13,9 +13,6 @@ MAX_ABS_LOG_LENGTH_SCALE = 100.0
 With `latent.sigma_f_bar` near its upper end the mean between pseudo-inputs swings that far.
 """
 
-UNINFORMATIVE = 1e30
-"""Variance of the noise of padding [log m], which tells nothing."""
-
 
 def given_theta(config: Config) -> FloatArray:
     """Values given by the configuration, (T,), in log space; T is 6, with classes 14."""
@@ -67,7 +64,8 @@ def latent_log_length_scales(
         l_bar = np.where(bar.mask, l_bar, 0.0)
         mean = l_bar.sum(axis=1, keepdims=True) / bar.mask.sum(axis=1, keepdims=True)
         covariance = squared_exponential(r_bar[:, :, None], r_bar[:, None, :], *kernel)
-        np.einsum('sii->si', covariance)[:] += np.where(bar.mask, noise_bar, UNINFORMATIVE)
+        # Padding has so much noise that it tells nothing.
+        np.einsum('sii->si', covariance)[:] += np.where(bar.mask, noise_bar, 1e30)
         centred = np.where(bar.mask, l_bar - mean, 0.0)
         weight = np.linalg.solve(covariance, centred[:, :, None]).swapaxes(1, 2)
         knots = frame.knots[: n_knots[segments].max()]

@@ -359,9 +359,8 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     r, cell, height = cells.r, cells.cell, distance(cells.x, cells.y, cells.z, plane)
     is_seen, reach = np.zeros(N_CELLS, dtype=np.bool_), np.full(N_SECTORS, LEAST_REACH)
     sector, is_on = cell // N_RINGS, np.abs(height * cells.inverse) < 1.0
-    is_seen[cell[is_on]] = True
     # The farthest is the last of a sector.
-    reach[sector[is_on]] = np.maximum(r[is_on], LEAST_REACH)
+    is_seen[cell[is_on]], reach[sector[is_on]] = True, np.maximum(r[is_on], LEAST_REACH)
     below = np.flatnonzero((height * cells.inverse < -CLEARLY_OFF) & ~cells.is_alone)
     crossing, sector = crossing_of(r[below], height[below], plane), sector[below]
     ring = np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
