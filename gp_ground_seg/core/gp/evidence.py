@@ -204,14 +204,13 @@ def _of_nearest(
 
     `side` is 1 or -1; the standard deviation grows by `step` (K,) for each segment on the way.
     """
-    n, distance = len(height), np.arange(2 * len(height))[:, None]
+    n, distance = len(height), np.arange(2 * len(height), dtype=np.int32)[:, None]
     # Twice around the ring; as seen from before the first one, the nearest is the least so far.
-    height, deviation = (np.concatenate([table[::side]] * 2) for table in (height, deviation))
-    seen = deviation - distance * step
+    seen = np.concatenate([deviation[::side]] * 2) - distance * step
     least = np.minimum.accumulate(seen)
-    nearest = np.maximum.accumulate(np.where(seen == least, distance, 0))[n - 1 : -1]
+    nearest = np.maximum.accumulate(np.where(seen == least, distance, 0))[n - 1 : -1] % n
     least = least[n - 1 : -1] + distance[n:] * step
-    return np.take_along_axis(height, nearest, axis=0)[::side], least[::side]
+    return np.take_along_axis(height[::side], nearest, axis=0)[::side], least[::side]
 
 
 def at_candidates(from_neighbours: Evidence, frame: Frame) -> Evidence:
