@@ -26,6 +26,12 @@ def branch(condition: bool, a: Any, b: Any) -> Any:
     return a if condition else b
 
 
+@compiled_form(kernels.nearer_first)
+def nearer_first(r_a: float, r_b: float) -> tuple[float, float]:
+    """Do what the twin does."""
+    return choose(r_a < r_b, r_a, r_b), choose(r_a < r_b, r_b, r_a)
+
+
 def _make_exp_neg(number: type, halvings: int, negligible: float) -> Callable[[Any], Any]:
     """Return ``exp(-x)`` for x >= 0 of a type of numbers; zero from `negligible` on.
 

@@ -144,31 +144,20 @@ def highest_ground(frame: Frame, z: FloatArray, seed: BoolArray, max_slope: floa
     n_segments, n_bins = len(candidates.offsets) - 1, int(candidates.bin[seed].max()) + 1
     table = np.full((n_segments, n_bins), np.inf)
     table[segment[seed], candidates.bin[seed]] = z[seed]
-    edges = frame.knots[:n_bins]
-    _rise_along(table, max_slope * np.diff(edges))
-    _rise_around(table, max_slope * 2.0 * math.pi / n_segments * edges)
-    _rise_along(table, max_slope * np.diff(edges))
+    along = max_slope * frame.knots[:n_bins, None]
+    around = np.arange(3.0 * n_segments)[:, None] * (2.0 * math.pi / n_segments * along.T)
+    table = _rising(table.T, along).T
+    table = _rising(np.concatenate([table] * 3), around)[n_segments : 2 * n_segments]
+    table = _rising(table.T, along).T
     near = np.minimum(candidates.bin, n_bins - 1)
     return np.where(candidates.bin < n_bins, table[segment, near], np.inf)
 
 
-def _rise_along(table: FloatArray, rise: FloatArray) -> None:
-    n_bins = table.shape[1]
-    for j in range(1, n_bins):
-        np.minimum(table[:, j], table[:, j - 1] + rise[j - 1], out=table[:, j])
-    for j in range(n_bins - 2, -1, -1):
-        np.minimum(table[:, j], table[:, j + 1] + rise[j], out=table[:, j])
-
-
-def _rise_around(table: FloatArray, rise: FloatArray) -> None:
-    for reach in _reaches(len(table)):
-        for shift in (reach, -reach):
-            np.minimum(table, np.roll(table, shift, axis=0) + reach * rise, out=table)
-
-
-def _reaches(n_segments: int) -> list[int]:
-    """Segments that values move on by, in turn, to have come to all of the ring: 1, 2, 4, ..."""
-    return [2**k for k in range((n_segments - 1).bit_length())]
+def _rising(table: FloatArray, place: FloatArray) -> FloatArray:
+    """Least of all rows of a table, which rise from each on to either side with `place`."""
+    onwards = np.minimum.accumulate(table - place) + place
+    backwards = np.minimum.accumulate((table + place)[::-1])[::-1] - place
+    return np.minimum(onwards, backwards)
 
 
 def evidence_of_neighbours(
@@ -215,12 +204,13 @@ def _of_nearest(
 
     `side` is 1 or -1; the standard deviation grows by `step` (K,) for each segment on the way.
     """
-    height, deviation = np.roll(height, side, axis=0), np.roll(deviation, side, axis=0) + step
-    for reach in _reaches(len(height)):
-        farther = np.roll(deviation, side * reach, axis=0) + reach * step
-        np.copyto(height, np.roll(height, side * reach, axis=0), where=farther < deviation)
-        np.minimum(deviation, farther, out=deviation)
-    return height, deviation
+    n, distance = len(height), np.arange(2 * len(height), dtype=np.int32)[:, None]
+    # Twice around the ring; as seen from before the first one, the nearest is the least so far.
+    seen = np.concatenate([deviation[::side]] * 2) - distance * step
+    least = np.minimum.accumulate(seen)
+    nearest = np.maximum.accumulate(np.where(seen == least, distance, 0))[n - 1 : -1] % n
+    least = least[n - 1 : -1] + distance[n:] * step
+    return np.take_along_axis(height[::side], nearest, axis=0)[::side], least[::side]
 
 
 def at_candidates(from_neighbours: Evidence, frame: Frame) -> Evidence:

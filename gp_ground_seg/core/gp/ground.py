@@ -12,6 +12,7 @@ from gp_ground_seg.core.frame import (
     Frame,
     GroundSurface,
     IntArray,
+    PointArray,
     Values,
 )
 from gp_ground_seg.core.gp.evidence import (
@@ -26,7 +27,6 @@ from gp_ground_seg.core.gp.evidence import (
 )
 from gp_ground_seg.core.gp.kernels import (
     Padded,
-    add_noise,
     batches,
     line_covariance,
     line_variances,
@@ -113,6 +113,8 @@ def fit_surfaces(
         join_evidence(found, from_neighbours, knots, theta, observation)
     mean += frame.prior_mean
 
+
+_Places = tuple[PointArray, PointArray]  # ranges, and length-scales there [m]
 
 OBSTACLE_DEPTH = 1.0
 """Height over which the lowest returns of obstacles are spread [m]."""
@@ -241,38 +243,38 @@ def grow_inliers(
     a candidate among others, or that joins in doubt, shows less: see `noise_among` and
     `noise_in_doubt`. Where the ground carries on to it there is no doubt.
     """
-    candidates, segment = frame.candidates, frame.candidates.segment
-    z, chosen, growth = candidates.z - frame.prior_mean, found.inlier, model.growth
     sill, gate_noise = variances_of(frame, theta, model.observation, ROUNDING_SINGLE)
-    found.alike[:] = _count_near(candidates, np.exp(theta[3]) if model.by_roughness else 0.0)
-    certain, beside = noise_among(found.alike, gate_noise), at_candidates(from_neighbours, frame)
-    above = contradicts(*beside, z, gate_noise) & ~frame.land
-    noise, is_own = certain.copy(), segment % step == 0
-    blocks = _prior_blocks(frame, found.log_length_scale, sill, model.observation, step)
-    height, variance = np.zeros(len(z)), prior_variance(sill, model.observation, candidates.r)
-    predicted, stops = combined(height, variance, *beside), frame.in_face | above
-    chosen[:], joining = False, found.seed & ~above & is_own
+    grows = frame.candidates.segment % step == 0
+    of_these = {name: getattr(frame, name)[grows] for name in ('onward', 'land', 'in_face')}
+    frame = frame._replace(candidates=frame.candidates.where(grows), **of_these)
+    candidates, segment = frame.candidates, frame.candidates.segment
+    z, growth = candidates.z - frame.prior_mean, model.growth
+    alike = _count_near(candidates, np.exp(theta[3]) if model.by_roughness else 0.0)
+    certain, beside = noise_among(alike, gate_noise), at_candidates(from_neighbours, frame)
+    above, noise = contradicts(*beside, z, gate_noise) & ~frame.land, certain.copy()
+    tables = _prior_tables(frame, found.log_length_scale[grows], sill, model.observation)
+    prior, stops = prior_variance(sill, model.observation, candidates.r), frame.in_face | above
+    predicted = combined(np.zeros(len(z)), prior, *beside)
+    chosen, joining = np.zeros(len(z), np.bool_), found.seed[grows] & ~above
     in_doubt, has_inliers = joining & frame.in_face, np.zeros(candidates.n_segments, np.bool_)
     with np.errstate(over='ignore', invalid='ignore'):  # the square of 1e200 m: no fit
         while True:
             if model.by_roughness:
-                of_these = (values[in_doubt] for values in (z, *predicted, noise, frame.in_face))
-                noise[in_doubt] = noise_in_doubt(*of_these)
+                known = (values[in_doubt] for values in (z, *predicted, noise, frame.in_face))
+                noise[in_doubt] = noise_in_doubt(*known)
             chosen |= joining
-            for layout, table in blocks:
-                if joining[layout.place].any():
-                    which, given, spread = _condition(layout, table, joining, noise)
-                    height[which], variance[which] = z[which] - given, spread
-            predicted = combined(height, variance, *beside)
+            residual, variance = _observe(tables, candidates, joining, noise)
+            predicted = combined(z - residual, variance, *beside)
             fitting = fits(z, *predicted, gate_noise, growth)
             on_slope, is_shown = _on_slope(frame, chosen, fitting, stops, growth)
             # Before anything has joined, only the evidence of neighbours decides.
             has_inliers[segment[joining]] = True
-            may_join = ~chosen & is_own & (has_inliers[segment] | (beside.precision > 0.0))
+            may_join = ~chosen & (has_inliers[segment] | (beside.precision > 0.0))
             joining, in_doubt = may_join & (fitting | on_slope), may_join & fitting & ~is_shown
             if not joining.any():
                 break
-    found.doubt[:] = noise - certain
+    found.inlier[:] = False
+    found.inlier[grows], found.alike[grows], found.doubt[grows] = chosen, alike, noise - certain
 
 
 def _on_slope(
@@ -309,47 +311,52 @@ def carries_on(rise: Values, distance: Values, onward: Values, land: Values) -> 
     return (rise > 0.0) & (land | (RISES_ON * rise <= onward * distance))
 
 
-def _prior_blocks(
-    frame: Frame, u: FloatArray, sill: float, observation: ObservationConfig, step: int
-) -> list[tuple[Padded, FloatArray]]:
-    """Prior of every `step`-th segment by log length-scales `u` (C,), in blocks of S segments.
+def _prior_tables(
+    frame: Frame, u: FloatArray, sill: float, observation: ObservationConfig
+) -> PointArray:
+    """Prior of every segment by log length-scales `u` (C,).
 
-    A table, (S, n, n + 1), has the covariance of their heights, and then their residuals, which
-    are those given the inliers so far; in single precision.
+    The table of a segment has a row and a column with the residuals of its candidates, and then
+    the covariance of their heights. In single precision, (M, 1 + n, 1 + n) for at most n.
     """
-    candidates, blocks = frame.candidates, []
+    candidates = frame.candidates
     z = np.clip(candidates.z - frame.prior_mean, -FARTHEST, FARTHEST)
-    for segments in batches(np.arange(0, candidates.n_segments, step), candidates.offsets):
+    width = 1 + np.diff(candidates.offsets).max(initial=0)
+    tables = np.zeros((candidates.n_segments, width, width), np.float32)
+    for segments in batches(np.arange(candidates.n_segments), candidates.offsets):
         layout = Padded.of(segments, candidates.offsets)
-        columns = (layout.take(values)[:, None] for values in (candidates.r, u, z))
-        r, own_u, residual = (values.astype(np.float32) for values in columns)
-        own_r, l = r.swapaxes(1, 2), np.exp(own_u)  # noqa: E741
-        covariance = paciorek(own_r, l.swapaxes(1, 2), r, l, sill)
-        covariance += line_covariance(own_r, r, *line_variances(observation))
-        blocks.append((layout, np.concatenate([covariance, residual.swapaxes(1, 2)], axis=2)))
-    return blocks
+        columns = (layout.take(values).astype(np.float32) for values in (candidates.r, u, z))
+        r, own_u, residual = columns
+        places, own = (r, np.exp(own_u)), slice(1, 1 + r.shape[1])
+        tables[segments, 0, own] = tables[segments, own, 0] = residual
+        tables[segments, own, own] = _prior(places, places, sill, observation)
+    return tables
 
 
-def _condition(
-    layout: Padded, table: FloatArray, new: BoolArray, noise: FloatArray
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Change the table of a block by observing those that are `new`, with `noise` (C,).
+def _observe(
+    tables: PointArray, candidates: Candidates, new: BoolArray, noise: FloatArray
+) -> tuple[PointArray, FloatArray]:
+    """Observe the candidates that are `new`, with `noise`, two (C,); residuals and variances."""
+    offsets, segment, which = candidates.offsets, candidates.segment, np.flatnonzero(new)
+    bounds, size = np.searchsorted(which, offsets), 1 + np.diff(offsets)
+    column = np.arange(1, len(new) + 1) - offsets[segment]
+    # One by one: a batch of small matrices is mostly padding.
+    for m in np.flatnonzero(np.diff(bounds)):
+        table, own = tables[m, : size[m], : size[m]], which[bounds[m] : bounds[m + 1]]
+        rows = table.take(column[own], axis=0)
+        within = rows.take(column[own], axis=1)
+        within.ravel()[:: len(within) + 1] += noise[own]
+        rows = whitened(within, rows)
+        table -= rows.T @ rows
+    return tables[segment, 0, column], tables[segment, column, column].astype(np.float64)
 
-    Returns candidates of their segments, (P,), with residual and variance.
-    """
-    is_new = new[layout.place] & layout.mask
-    own = np.flatnonzero(is_new.any(axis=1))
-    # Places of the new ones, first in each row; the rest is padding.
-    is_new, n_new = is_new[own], is_new[own].sum(axis=1)[:, None]
-    place, mask = layout.place[own], layout.mask[own]
-    at = np.argsort(~is_new, axis=1, kind='stable')[:, : n_new.max(initial=0)]
-    is_new, observed = np.arange(at.shape[1]) < n_new, np.take_along_axis(place, at, axis=1)
-    rows = table[own[:, None], at]
-    within = add_noise(np.take_along_axis(rows, at[:, None], axis=2), noise[observed], is_new)
-    rows = whitened(within, rows, is_new)
-    given = table[own] - np.matmul(rows[:, :, :-1].swapaxes(1, 2), rows)
-    table[own] = given
-    return place[mask], given[:, :, -1][mask], np.einsum('sii->si', given[:, :, :-1])[mask]
+
+def _prior(a: _Places, b: _Places, sill: float, observation: ObservationConfig) -> PointArray:
+    """Prior covariance of heights at ranges with length-scales, (S, n) and (S, k) [m^2]."""
+    r_a, r_b = a[0][:, :, None], b[0][:, None]
+    covariance: PointArray = paciorek(r_a, a[1][:, :, None], r_b, b[1][:, None], sill)
+    covariance += line_covariance(r_a, r_b, *line_variances(observation))
+    return covariance
 
 
 def regress(
@@ -362,30 +369,26 @@ def regress(
     """Surface of every `step`-th segment by its own inliers and `theta`, into `found`."""
     candidates, knot_u = frame.candidates, found.knot_log_length_scale
     which = np.flatnonzero(found.inlier)
-    segments = np.arange(0, candidates.n_segments, step)
     sill, noise = variances_of(frame, theta, observation, ROUNDING)
-    line = line_variances(observation)
     noise = (noise_among(found.alike, noise) + found.doubt)[which]
     r, z = candidates.r[which], candidates.z[which] - frame.prior_mean
     length_scale = np.exp(found.log_length_scale[which])
     offsets = np.searchsorted(which, candidates.offsets)
-    found.mean[segments] = found.std[segments] = np.nan
-    for own in batches(segments, offsets):
+    found.mean[::step] = found.std[::step] = np.nan
+    for own in batches(np.arange(0, candidates.n_segments, step), offsets):
         layout = Padded.of(own, offsets)
-        own_r, own_l = layout.take(r)[:, :, None], layout.take(length_scale, 1.0)[:, :, None]
-        is_wanted = np.isfinite(knot_u[own])
-        n_knots = int(is_wanted.sum(axis=1).max())
-        is_wanted, knots = is_wanted[:, :n_knots], frame.knots[:n_knots]
-        knot_l = np.where(is_wanted, np.exp(knot_u[own, :n_knots]), 1.0)[:, None]
-        within = paciorek(own_r, own_l, own_r.swapaxes(1, 2), own_l.swapaxes(1, 2), sill)
-        within += line_covariance(own_r, own_r.swapaxes(1, 2), *line)
-        add_noise(within, layout.take(noise), layout.mask)
-        rows = paciorek(own_r, own_l, knots, knot_l, sill) + line_covariance(own_r, knots, *line)
-        rows = whitened(
-            within, np.concatenate([rows, layout.take(z)[:, :, None]], axis=2), layout.mask
-        )
+        places = layout.take(r), layout.take(length_scale, 1.0)
+        # NaN behind the last knot that is wanted, and so is what follows there.
+        n_knots = int(np.isfinite(knot_u[own]).sum(axis=1).max())
+        knots, knot_l = frame.knots[:n_knots], np.exp(knot_u[own, :n_knots])
+        within = _prior(places, places, sill, observation)
+        np.einsum('sii->si', within)[:] += layout.take(noise)
+        rows = _prior(places, (knots[None], knot_l), sill, observation)
+        rows = np.concatenate([rows, layout.take(z)[:, :, None]], axis=2)
+        for own_rows, covariance, n in zip(rows, within, layout.mask.sum(axis=1), strict=True):
+            own_rows[:n] = whitened(covariance[:n, :n], own_rows[:n])
+            own_rows[n:] = 0.0
         rows, own_z = rows[:, :, :-1], rows[:, :, -1:]
-        height = np.matmul(own_z.swapaxes(1, 2), rows)[:, 0]
         variance = prior_variance(sill, observation, knots) - np.einsum('sij,sij->sj', rows, rows)
-        found.mean[own, :n_knots] = np.where(is_wanted, height, np.nan)
-        found.std[own, :n_knots] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+        found.mean[own, :n_knots] = np.matmul(own_z.swapaxes(1, 2), rows)[:, 0]
+        found.std[own, :n_knots] = np.sqrt(np.maximum(variance, 0.0))

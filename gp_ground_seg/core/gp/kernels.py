@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, Values
-from gp_ground_seg.core.jit import choose, shared
+from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, PointArray, Values
+from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import ObservationConfig
 
 try:
@@ -22,7 +22,7 @@ except ImportError:  # then BLAS keeps its threads
 LARGEST_EXPONENT = 40.0
 """Largest x of which ``exp(-x)`` is computed: 4e-18, as good as nothing. Squares of less lose
 digits in single precision, and take numpy tens of times as long."""
-SEGMENTS_PER_BATCH = 48
+SEGMENTS_PER_BATCH = 24
 """Larger batches waste room on padding and leave the processor's cache; smaller ones cost
 calls."""
 
@@ -30,6 +30,11 @@ calls."""
 def exp_neg(x: Values) -> Values:
     """``exp(-x)``; of numbers in compiled code, see `gp_ground_seg.core.compiled.numerics`."""
     return np.exp(-np.minimum(x, LARGEST_EXPONENT))
+
+
+def nearer_first(r_a: Values, r_b: Values) -> tuple[Values, Values]:
+    """Both ranges, the nearer one first; a choice between numbers in compiled code."""
+    return np.minimum(r_a, r_b), np.maximum(r_a, r_b)
 
 
 @shared
@@ -41,9 +46,9 @@ def paciorek(r_a: Values, l_a: Values, r_b: Values, l_b: Values, variance: Value
     Of ranges and length-scales [m], and the prior variance ``sigma_f^2`` [m^2]. As precise as
     these: there is no constant, which in compiled code would be of double precision.
     """
-    spread, product = l_a * l_a + l_b * l_b, l_a * l_b
+    spread, product = l_a * l_a + l_b * l_b, (l_a + l_a) * l_b
     distance = r_a - r_b
-    root = np.sqrt((product + product) / spread)
+    root = np.sqrt(product / spread)
     return variance * root * exp_neg(distance * distance / spread)
 
 
@@ -69,8 +74,7 @@ def line_covariance(r_a: Values, r_b: Values, slope: Values, sixth: Values) -> V
     `sixth` is ``drift^2 / 6`` [1/m], where ``drift^2`` is the variance that the slope gains over a
     metre.
     """
-    is_nearer = r_a < r_b
-    near, far = choose(is_nearer, r_a, r_b), choose(is_nearer, r_b, r_a)
+    near, far = nearer_first(r_a, r_b)
     return near * (slope * far + sixth * near * (far + far + far - near))
 
 
@@ -116,30 +120,26 @@ def batches(segments: IntArray, offsets: IntArray) -> list[IntArray]:
     return np.array_split(order, n_batches) if n_batches else []
 
 
-def add_noise(covariance: FloatArray, noise: FloatArray, mask: BoolArray) -> FloatArray:
-    """Add noise to the diagonals; padding becomes a unit matrix, which changes nothing.
+def whitened(covariance: PointArray, rows: PointArray) -> PointArray:
+    """Solve ``L X = rows`` for the Cholesky factor L of a covariance (n, n), and rows (n, k).
 
-    `covariance` (S, n, n) is changed in place and returned; `noise` (S, n), (S, 1) or (1, 1) are
-    variances, `mask` (S, n) is False where there is padding.
+    NaN where it is not positive definite. Rows that are contiguous are overwritten.
     """
-    covariance *= mask[:, :, None] & mask[:, None, :]
-    np.einsum('sii->si', covariance)[:] += np.where(mask, noise, 1.0)
-    return covariance
-
-
-def whitened(covariance: FloatArray, rows: FloatArray, mask: BoolArray) -> FloatArray:
-    """Solve ``L X = rows`` for Cholesky factors L of covariances (S, n, n), and rows (S, n, k).
-
-    X is 0 where there is padding, where `mask` (S, n) is False. Segments are solved one by one:
-    ``np.linalg.solve``, which is for any matrix, takes several times as long.
-    """
-    from scipy.linalg.blas import get_blas_funcs
-
-    solve, result = get_blas_funcs('trsm', (rows,)), rows * mask[:, :, None]
-    for factor, own in zip(np.linalg.cholesky(covariance), result, strict=True):
-        # BLAS takes arrays by columns: to it ours are transposed.
-        own[:] = solve(1.0, factor.T, own.T, side=1, overwrite_b=True).T
+    factorise, solve = _solvers(rows.dtype)
+    # LAPACK takes arrays by columns: to it ours are transposed.
+    factor, is_failed = factorise(covariance.T)
+    if is_failed:
+        return np.full_like(rows, np.nan)
+    result: PointArray = solve(1.0, factor, rows.T, side=1, overwrite_b=True).T
     return result
+
+
+@functools.cache
+def _solvers(dtype: np.dtype[np.floating]) -> tuple[Any, Any]:
+    """Cholesky factor and triangular solution for a type."""
+    from scipy.linalg import get_blas_funcs, get_lapack_funcs
+
+    return get_lapack_funcs('potrf', dtype=dtype), get_blas_funcs('trsm', dtype=dtype)
 
 
 def inverted(covariance: FloatArray) -> tuple[FloatArray, float]:
@@ -147,12 +147,8 @@ def inverted(covariance: FloatArray) -> tuple[FloatArray, float]:
 
     NaN where it is not positive definite. Compiled code reads, and overwrites, its upper triangle.
     """
-    try:
-        factor = np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        return np.full_like(covariance, np.nan), np.nan
-    inverse: Any = np.linalg.inv(covariance)
-    return inverse, float(np.log(np.diagonal(factor)).sum())
+    root = whitened(covariance, np.eye(len(covariance)))
+    return root.T @ root, -float(np.log(np.diagonal(root)).sum())
 
 
 @functools.cache

@@ -3,7 +3,7 @@
 import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Frame, IntArray
-from gp_ground_seg.core.gp.kernels import Padded, add_noise, batches, squared_exponential
+from gp_ground_seg.core.gp.kernels import Padded, batches, squared_exponential
 from gp_ground_seg.core.parameters.config import Config, LengthScaleConfig
 from gp_ground_seg.core.pipeline.lines import N_CLASSES
 
@@ -53,7 +53,7 @@ def latent_log_length_scales(
     [log m]; NaN there behind the bin of the last candidate.
     """
     candidates, pseudo, n_knots = frame.candidates, frame.pseudo, n_wanted_knots(frame)
-    sill_bar, square_l_bar, noise_bar = np.exp(2.0 * theta[2:5])
+    sill_bar, square_l_bar, noise_bar = np.exp(2.0 * theta[2:5]).tolist()
     kernel, bound = (sill_bar, 0.5 / square_l_bar), MAX_ABS_LOG_LENGTH_SCALE
     knot_log_length_scale[::step] = np.nan
     for segments in batches(np.arange(0, candidates.n_segments, step), candidates.offsets):
@@ -64,14 +64,15 @@ def latent_log_length_scales(
         l_bar = np.where(bar.mask, l_bar, 0.0)
         mean = l_bar.sum(axis=1, keepdims=True) / bar.mask.sum(axis=1, keepdims=True)
         covariance = squared_exponential(r_bar[:, :, None], r_bar[:, None, :], *kernel)
-        add_noise(covariance, np.full((1, 1), noise_bar), bar.mask)
+        # Padding has so much noise that it tells nothing.
+        np.einsum('sii->si', covariance)[:] += np.where(bar.mask, noise_bar, 1e30)
         centred = np.where(bar.mask, l_bar - mean, 0.0)
-        weight = np.linalg.solve(covariance, centred[:, :, None])
+        weight = np.linalg.solve(covariance, centred[:, :, None]).swapaxes(1, 2)
         knots = frame.knots[: n_knots[segments].max()]
-        wanted = np.empty((len(r_bar), n + len(knots), 1))
-        wanted[:, :n, 0], wanted[:, n:, 0] = layout.take(candidates.r), knots
-        cross = squared_exponential(wanted, r_bar[:, None], *kernel)
-        found = np.clip((cross @ weight)[:, :, 0] + mean, -bound, bound)
+        wanted = np.empty((len(r_bar), 1, n + len(knots)))
+        wanted[:, 0, :n], wanted[:, 0, n:] = layout.take(candidates.r), knots
+        cross = squared_exponential(r_bar[:, :, None], wanted, *kernel)
+        found = np.clip((weight @ cross)[:, 0] + mean, -bound, bound)
         log_length_scale[layout.place[layout.mask]] = found[:, :n][layout.mask]
         is_wanted = np.arange(len(knots)) < n_knots[segments, None]
         knot_log_length_scale[segments, : len(knots)] = np.where(is_wanted, found[:, n:], np.nan)

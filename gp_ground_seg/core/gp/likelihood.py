@@ -40,13 +40,13 @@ def log_likelihood(
     `theta`, (T,).
     """
     value, gradient = 0.0, np.zeros(len(theta))
-    for m in range(len(inliers.offsets) - 1):
+    for m in np.flatnonzero(np.diff(inliers.offsets)):
         own = slice(inliers.offsets[m], inliers.offsets[m + 1])
         bar = slice(inliers.bar_offsets[m], inliers.bar_offsets[m + 1])
         r, z, u = inliers.r[own], inliers.z[own], inliers.log_length_scale[own]
-        if len(r) > 0 and bar.start == bar.stop:
+        if bar.start == bar.stop:
             value += observe(theta, gradient, r, z, u, observation)[0]
-        elif len(r) > 0:
+        else:
             bars = inliers.r_bar[bar], inliers.log_extent[bar], inliers.kind[bar]
             latent = predict(theta, *bars, r)
             own_value, g = observe(theta, gradient, r, z, latent.u, observation)

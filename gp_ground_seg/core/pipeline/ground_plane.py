@@ -358,17 +358,14 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     """
     r, cell, height = cells.r, cells.cell, distance(cells.x, cells.y, cells.z, plane)
     is_seen, reach = np.zeros(N_CELLS, dtype=np.bool_), np.full(N_SECTORS, LEAST_REACH)
-    for c in np.flatnonzero(np.abs(height * cells.inverse) < 1.0):
-        is_seen[cell[c]] = True
-        # The farthest is the last of a sector.
-        reach[cell[c] // N_RINGS] = max(r[c], LEAST_REACH)
-    refutation = 0.0
-    for c in np.flatnonzero((height * cells.inverse < -CLEARLY_OFF) & ~cells.is_alone):
-        crossing, sector = crossing_of(r[c], height[c], plane), cell[c] // N_RINGS
-        ring = np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
-        if crossing < reach[sector] and not is_seen[sector * N_RINGS + ring]:
-            refutation += refutation_by(crossing)
-    return refutation
+    sector, is_on = cell // N_RINGS, np.abs(height * cells.inverse) < 1.0
+    # The farthest is the last of a sector.
+    is_seen[cell[is_on]], reach[sector[is_on]] = True, np.maximum(r[is_on], LEAST_REACH)
+    below = np.flatnonzero((height * cells.inverse < -CLEARLY_OFF) & ~cells.is_alone)
+    crossing, sector = crossing_of(r[below], height[below], plane), sector[below]
+    ring = np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
+    counts = (crossing < reach[sector]) & ~is_seen[sector * N_RINGS + ring]
+    return float(refutation_by(crossing[counts]).sum())
 
 
 def refine(

@@ -66,8 +66,7 @@ def label_points(
     x, y, z = scan.xyz.T
     over = z - at_points(surface.knots, surface.mean, grid)
     if not relief.is_level:
-        inside = np.flatnonzero(grid.inside)
-        over[inside] -= relief.at(x[inside], y[inside])
+        over -= relief.at(x, y)
     highest = highest_ground(height)
     near, tile = np.flatnonzero(is_near(over, highest)), as_index(tiles.tile)
     roughness = np.zeros(len(faces.is_face))
@@ -78,7 +77,7 @@ def label_points(
     band = ground_band(roughness, highest, label).astype(dtype)
     lowest = np.append(tiles.lowest_z.astype(np.float64), 0.0)
     top = top_of_face(roughness, lowest, faces.has_occluded_base, label)
-    is_in_flat = is_flat(scan.extent[grid.cell], label.ground_tolerance)
+    is_in_flat = is_flat(scan.extent, label.ground_tolerance)[as_index(grid.cell)]
     is_limited = faces.is_face[tile] & (faces.has_occluded_base[tile] | ~is_in_flat)
     top = np.where(is_limited, top.astype(dtype)[tile], np.inf).astype(dtype)
     depth = depth_of_ground(height, label)

@@ -223,23 +223,20 @@ def reduce_cells(
     size = grid.n_segments * grid.n_bins
     inside = np.flatnonzero(grid.inside)
     cell, z = as_index(grid.cell[inside]), xyz[:, 2]
-    z_inside, r_inside = z[inside], grid.r[inside]
-    lowest_z, lowest_r = np.full((2, size), np.inf, dtype=z.dtype)
-    highest_z = np.full(size, -np.inf, dtype=z.dtype)
+    z_inside = z[inside]
+    lowest_z, highest_z = np.full((2, size), np.inf, dtype=z.dtype)
+    highest_z[:] = -np.inf
     np.minimum.at(lowest_z, cell, z_inside)
     np.maximum.at(highest_z, cell, z_inside)
+    # What is left after each is mostly one point of each cell.
     lowest = np.flatnonzero(z_inside == lowest_z[cell])
-    np.minimum.at(lowest_r, cell[lowest], r_inside[lowest])
-    lowest = lowest[r_inside[lowest] == lowest_r[cell[lowest]]]
-    # What is left is mostly one point of each cell.
-    x, y = xyz[:, 0][inside[lowest]], xyz[:, 1][inside[lowest]]
-    # The first one is written last.
-    order = np.lexsort((y, x))[::-1]
-    places, lowest = cell[lowest[order]], inside[lowest[order]]
-    lowest_x, lowest_y = np.full((2, size), np.inf, dtype=z.dtype)
-    lowest_x[places], lowest_y[places] = x[order], y[order]
+    lowest_r, lowest_x, lowest_y = others = np.full((3, size), np.inf, dtype=z.dtype)
+    for least, values in zip(others, (grid.r, xyz[:, 0], xyz[:, 1]), strict=True):
+        place, own = cell[lowest], values[inside[lowest]]
+        np.minimum.at(least, place, own)
+        lowest = lowest[own == least[place]]
     lowest_tile = np.full(size, OUTSIDE, dtype=np.int32)
-    lowest_tile[places] = tile[lowest]
+    lowest_tile[cell[lowest]] = tile[inside[lowest]]
     number = np.bincount(cell, minlength=size).astype(np.int32)
     return (
         np.column_stack([lowest_z, lowest_r, highest_z, lowest_x, lowest_y]),

@@ -57,13 +57,14 @@ class Relief(NamedTuple):
         corners = height[:-1, :-1], height[1:, :-1], height[:-1, 1:], height[1:, 1:]
         return cls(np.stack(piece_of(*corners), axis=-1))
 
+    @np.errstate(invalid='ignore')
     def at(self, x: PointArray, y: PointArray) -> PointArray:
-        """Height at places (P,) that are finite, (P,) [m], in their precision."""
+        """Height at places (P,), (P,) [m], in their precision; NaN where a place is NaN."""
         u, v = (from_first_middle(place, x.dtype.type) for place in (x, y))
         # One index: with two it takes three times as long.
         place = u.astype(np.int64) * (N_SIDES - 1) + v.astype(np.int64)
         pieces = self.pieces.reshape(-1, 4).astype(x.dtype)
-        result: PointArray = height_in(pieces.take(place, axis=0).T, u, v)
+        result: PointArray = height_in(pieces.take(place, axis=0, mode='clip').T, u, v)
         return result
 
     def at_knots(self, knots: FloatArray, n_segments: int) -> PointArray:

@@ -11,6 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from gp_ground_seg.core.frame import CellArray, FloatArray, IntArray, Tiles, as_index
 
@@ -89,20 +90,22 @@ def levels_about(
     block_to_row[blocks] = np.arange(len(blocks))
     own, is_known = block_to_row[place], level != UNKNOWN_LEVEL
     entry = own[is_known] * N_LEVELS + level[is_known]
-    counts = np.bincount(entry, minlength=shape[0] * N_LEVELS).reshape(shape)
-    total = np.zeros((len(blocks), N_LEVELS), dtype=np.int64)
+    # Nine blocks have few tiles, and small numbers are added faster.
+    counts = np.bincount(entry, minlength=shape[0] * N_LEVELS).reshape(shape).astype(np.int16)
+    total = np.zeros((len(blocks), N_LEVELS), dtype=np.int16)
     for step in (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel():
-        total += counts[block_to_row[blocks + step]]
+        total += counts.take(block_to_row[blocks + step], axis=0)
     total[:, prior_level] += window.prior
     result: IntArray = level_at(total, window.share)[own]
     return result
 
 
-def level_at(counts: IntArray, share: float) -> IntArray:
+def level_at(counts: npt.NDArray[np.integer], share: float) -> IntArray:
     """Level that a `share` of the tiles of each row does not exceed.
 
-    `counts`, (R, levels), are the numbers of tiles by level.
+    `counts`, (R, levels), are the numbers of tiles by level, of any type of whole numbers.
     """
-    cumulative = counts.cumsum(axis=1)
-    result: IntArray = (cumulative <= share * (cumulative[:, -1:] - 1)).sum(axis=1)
+    cumulative = counts.cumsum(axis=1, dtype=counts.dtype)
+    most = np.floor(share * (cumulative[:, -1:] - 1)).astype(counts.dtype)
+    result: IntArray = np.count_nonzero(cumulative <= most, axis=1)
     return result

@@ -164,10 +164,9 @@ def _squares_of_blocks(place: CellArray, n_sides: int, sums: FloatArray, shift: 
     `sums` over the returns of tiles at a `place` (K,) are about one point in each block.
     """
     column, row = np.divmod(as_index(place), n_sides)
-    block = (column >> shift) * n_sides + (row >> shift)
-    blocks = np.array([np.bincount(block, total)[block] for total in sums])
-    square: FloatArray = slope_square(blocks)
-    return square
+    _, own = np.unique((column >> shift) * n_sides + (row >> shift), return_inverse=True)
+    square: FloatArray = slope_square(np.array([np.bincount(own, total) for total in sums]))
+    return square[own]
 
 
 @shared
