@@ -6,13 +6,6 @@ import numpy as np
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame
 from gp_ground_seg.core.gp import evidence
-from gp_ground_seg.core.gp.evidence import (
-    CLEARLY,
-    Evidence,
-    combined_surface,
-    is_on_object,
-    shown_by,
-)
 from gp_ground_seg.core.gp.kernels import prior_variance
 from gp_ground_seg.core.gp.model import SegmentSurfaces
 from gp_ground_seg.core.jit import compiled_form, jit
@@ -23,7 +16,7 @@ from gp_ground_seg.core.parameters.config import ObservationConfig
 def find_seeds(frame: Frame, theta: FloatArray, slope_std: float, seed: BoolArray) -> None:
     """Do what the twin does."""
     candidates, knots, sigma_n = frame.candidates, frame.knots, math.exp(theta[1])
-    n_segments, n_bins, max_slope = len(candidates.offsets) - 1, 0, CLEARLY * slope_std
+    n_segments, n_bins, max_slope = len(candidates.offsets) - 1, 0, evidence.CLEARLY * slope_std
     for c in range(len(seed)):
         n_bins = max(n_bins, candidates.bin[c] + 1) if seed[c] else n_bins
     if n_bins == 0:
@@ -48,7 +41,7 @@ def find_seeds(frame: Frame, theta: FloatArray, slope_std: float, seed: BoolArra
     for m in range(n_segments):
         for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
             if candidates.bin[i] < n_bins:
-                seed[i] &= not is_on_object(
+                seed[i] &= not evidence.is_on_object(
                     candidates.z[i] - frame.prior_mean, table[m, candidates.bin[i]], sigma_n
                 )
 
@@ -71,7 +64,7 @@ def evidence_of_neighbours(
     knots: FloatArray,
     theta: FloatArray,
     observation: ObservationConfig,
-) -> Evidence:
+) -> evidence.Evidence:
     """Do what the twin does: once around and again, either way."""
     n_segments, n_knots = mean.shape
     # Unsigned, as a signed index could count from the end.
@@ -84,7 +77,7 @@ def evidence_of_neighbours(
         mean_m, std_m, height, deviation = mean[m], std[m], own[0, m], own[1, m]
         for j in range(start, end):
             prior = prior_variance(sill, observation, knots[j])
-            height[j], deviation[j] = shown_by(mean_m[j], std_m[j], prior)
+            height[j], deviation[j] = evidence.shown_by(mean_m[j], std_m[j], prior)
     heights, precisions = np.zeros((n_segments, n_knots)), np.zeros((n_segments, n_knots))
     for side in range(2):
         nearest[:], nearest_std[:] = 0.0, np.inf
@@ -107,13 +100,13 @@ def evidence_of_neighbours(
         weighted, total = heights[m], precisions[m]
         for j in range(start, end):
             weighted[j] /= total[j] if total[j] > 0.0 else 1.0
-    return Evidence(heights, precisions)
+    return evidence.Evidence(heights, precisions)
 
 
 @compiled_form(evidence.join_evidence)
 def join_evidence(
     found: SegmentSurfaces,
-    from_neighbours: Evidence,
+    from_neighbours: evidence.Evidence,
     knots: FloatArray,
     theta: FloatArray,
     observation: ObservationConfig,
@@ -125,4 +118,6 @@ def join_evidence(
             if not math.isnan(found.knot_log_length_scale[m, j]):
                 prior = prior_variance(sill, observation, knots[j])
                 beside = from_neighbours.height[m, j], from_neighbours.precision[m, j]
-                mean[m, j], std[m, j] = combined_surface(mean[m, j], std[m, j], prior, *beside)
+                mean[m, j], std[m, j] = evidence.combined_surface(
+                    mean[m, j], std[m, j], prior, *beside
+                )

@@ -15,14 +15,6 @@ from gp_ground_seg.core.compiled.numerics import LANES
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, IntArray
 from gp_ground_seg.core.gp import ground
 from gp_ground_seg.core.gp.evidence import Evidence, between_knots, combined, contradicts
-from gp_ground_seg.core.gp.ground import (
-    ROUNDING_SINGLE,
-    carries_on,
-    fits,
-    noise_among,
-    noise_in_doubt,
-    variances_of,
-)
 from gp_ground_seg.core.gp.kernels import (
     line_covariance,
     line_variances,
@@ -62,7 +54,7 @@ class _Prior(NamedTuple):
 
 @jit(part=True)
 def _prior_of(frame: Frame, theta: FloatArray, observation: ObservationConfig) -> _Prior:
-    sill, noise = variances_of(frame, theta, observation, ROUNDING_SINGLE)
+    sill, noise = ground.variances_of(frame, theta, observation, ground.ROUNDING_SINGLE)
     slope, sixth = line_variances(observation)
     return _Prior(sill, slope, sixth, noise)
 
@@ -133,7 +125,7 @@ def regress(
             if found.inlier[c]:
                 r[n], length_scale[n] = candidates.r[c], found.log_length_scale[c]
                 columns.z[n] = candidates.z[c] - frame.prior_mean
-                columns.noise[n] = noise_among(found.alike[c], prior.noise) + found.doubt[c]
+                columns.noise[n] = ground.noise_among(found.alike[c], prior.noise) + found.doubt[c]
                 n += 1
         if n == 0:
             continue
@@ -189,7 +181,7 @@ def _begin(
         while far < stop and candidates.r[far] - r <= reach:
             far += 1
         found.alike[c] = far - near
-        columns.z[i], columns.noise[i] = z, noise_among(far - near, noise)
+        columns.z[i], columns.noise[i] = z, ground.noise_among(far - near, noise)
         height = precision = 0.0
         if len(from_neighbours.height) > 0:
             j = candidates.bin[c]
@@ -227,7 +219,7 @@ def _grow(
         i = columns.new[a]
         if model.by_roughness and frame.in_face[first + i]:
             height, variance = _predict(i, columns)
-            columns.noise[i] = noise_in_doubt(
+            columns.noise[i] = ground.noise_in_doubt(
                 columns.z[i], height, variance, columns.noise[i], True
             )
     n_inliers = done = 0
@@ -246,7 +238,7 @@ def _grow(
         if n_new == 0:
             break
     for c in range(first, first + n):
-        found.doubt[c] = columns.noise[c - first] - noise_among(found.alike[c], prior.noise)
+        found.doubt[c] = columns.noise[c - first] - ground.noise_among(found.alike[c], prior.noise)
 
 
 @jit(part=True)
@@ -271,18 +263,20 @@ def _find_joining(
         if not has_inliers and columns.neighbour_precision[i] == 0.0:
             continue
         height, variance = _predict(i, columns)
-        joins, falls, is_shown = fits(z, height, variance, noise, growth), False, False
+        joins, falls, is_shown = ground.fits(z, height, variance, noise, growth), False, False
         if last >= 0:
             rise = z - columns.z[last]
             distance = frame.candidates.r[c] - frame.candidates.r[first + last]
             walkable = is_walkable(rise, distance, growth.max_slope)
             if walkable and not in_face and not columns.above[i]:
-                is_shown = carries_on(rise, distance, frame.onward[c], frame.land[c])
+                is_shown = ground.carries_on(rise, distance, frame.onward[c], frame.land[c])
                 falls = rise <= 0.0
             elif not joins:
                 last = -1  # it stands on the ground, which does not go on behind it
         if joins and model.by_roughness and not is_shown:
-            columns.noise[i] = noise_in_doubt(z, height, variance, columns.noise[i], in_face)
+            columns.noise[i] = ground.noise_in_doubt(
+                z, height, variance, columns.noise[i], in_face
+            )
         if joins or is_shown or falls:
             columns.new[n_new] = i
             n_new += 1

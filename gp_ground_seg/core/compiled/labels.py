@@ -23,18 +23,7 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import LabelConfig
-from gp_ground_seg.core.pipeline.labels import (
-    N_LAYERS,
-    VOTE_UNITS,
-    ground_band,
-    is_near,
-    layer_of,
-    margin_after_vote,
-    margin_of,
-    top_of_face,
-    vote_of,
-    whole_units,
-)
+from gp_ground_seg.core.pipeline import labels as plain
 from gp_ground_seg.core.pipeline.relief import height_in
 from gp_ground_seg.core.pipeline.vertical_faces import is_flat
 
@@ -78,11 +67,11 @@ def label_points(
     # Of each tile: the band of ground, and the top of ground in other cells and in flat ones.
     limits, kind = np.empty((n_tiles + 1, 3), number), np.empty(len(scan.extent), np.int32)
     for t in range(n_tiles + 1):
-        limits[t, 0] = ground_band(roughness[t], highest, config)
+        limits[t, 0] = plain.ground_band(roughness[t], highest, config)
         limits[t, 1] = limits[t, 2] = math.inf
         if faces.is_face[t]:
             low, is_occluded = np.float64(scan.tiles.extremes[t, 0]), faces.has_occluded_base[t]
-            limits[t, 1] = top_of_face(roughness[t], low, is_occluded, config)
+            limits[t, 1] = plain.top_of_face(roughness[t], low, is_occluded, config)
             limits[t, 2] = limits[t, 1] if is_occluded else math.inf
     for c in range(len(kind)):
         kind[c] = 2 if is_flat(scan.extent[c], config.ground_tolerance) else 1
@@ -164,9 +153,9 @@ def _add_squares(
     outside, quarter = np.int32(len(sums) - 1), len(height) // 4
     for i in range(len(height)):
         h = np.float64(height[i])
-        is_low = is_near(h, highest)
+        is_low = plain.is_near(h, highest)
         near_tile[i] = tile[i] if is_low else outside
-        terms[i] = flag + np.int64(whole_units(h * h, units)) if is_low else 0
+        terms[i] = flag + np.int64(plain.whole_units(h * h, units)) if is_low else 0
     # In four places in turn: points side by side share a tile, and would wait for each other.
     for k in range(quarter):
         for i in (k, k + quarter, k + 2 * quarter, k + 3 * quarter):
@@ -185,7 +174,7 @@ def _set_margins(
     for i in range(len(tile)):
         t = three * np.uintp(tile[i] if tile[i] >= 0 else last)
         top = limits[t + np.uintp(kind[np.uintp(max(cell[i], np.int32(0)))])]
-        to.margin[i] = margin_of(to.height[i], z[i], limits[t], top, depth)
+        to.margin[i] = plain.margin_of(to.height[i], z[i], limits[t], top, depth)
 
 
 @jit()
@@ -208,24 +197,26 @@ def _vote(
         n += np.int64(rows[np.uintp(near_tile[i])] > 0)
     voters, places = voters[:n], np.empty(n, np.int32)
     # The sum of the votes in each layer of each row, whole numbers.
-    votes = np.zeros(n_rows * N_LAYERS, np.int64)
+    votes = np.zeros(n_rows * plain.N_LAYERS, np.int64)
     for k in range(n):
         i = np.uintp(voters[k])
-        layer = np.int32(layer_of(np.float64(scan.xyz[2, i]) - lowest, tolerance))
-        places[k] = rows[np.uintp(near_tile[i])] * np.int32(N_LAYERS) + layer
-        vote = vote_of(np.float64(margins[i]), tolerance)
-        votes[np.uintp(places[k])] += VOTER_FLAG + np.int64(vote + VOTE_UNITS)
+        layer = np.int32(plain.layer_of(np.float64(scan.xyz[2, i]) - lowest, tolerance))
+        places[k] = rows[np.uintp(near_tile[i])] * np.int32(plain.N_LAYERS) + layer
+        vote = plain.vote_of(np.float64(margins[i]), tolerance)
+        votes[np.uintp(places[k])] += VOTER_FLAG + np.int64(vote + plain.VOTE_UNITS)
     sums = _sum_around(around, votes)
     for k in range(n):
-        layer = places[k] % N_LAYERS
+        layer = places[k] % plain.N_LAYERS
         if places[k] >= len(sums):
             continue
         i, total = np.uintp(voters[k]), 0
-        for step in range(N_LAYERS - 1, N_LAYERS + 2):
-            total += sums[np.uintp(places[k] - layer + (layer + step) % N_LAYERS)]
+        for step in range(plain.N_LAYERS - 1, plain.N_LAYERS + 2):
+            total += sums[np.uintp(places[k] - layer + (layer + step) % plain.N_LAYERS)]
         number = total // VOTER_FLAG
-        mean = (total - number * VOTER_FLAG) / number - VOTE_UNITS
-        margins[i] = margin_after_vote(np.float64(margins[i]), mean * (tolerance / VOTE_UNITS))
+        mean = (total - number * VOTER_FLAG) / number - plain.VOTE_UNITS
+        margins[i] = plain.margin_after_vote(
+            np.float64(margins[i]), mean * (tolerance / plain.VOTE_UNITS)
+        )
 
 
 @jit(part=True)
@@ -261,12 +252,12 @@ def _number_tiles(tiles: Tiles, has_obstacle: BoolArray) -> tuple[CellArray, Cel
 @jit(part=True)
 def _sum_around(around: CellArray, votes: IntArray) -> IntArray:
     """Sum the votes of each tile with an obstacle and the eight around it, layer by layer."""
-    sums = np.zeros(len(around) * N_LAYERS, np.int64)
+    sums = np.zeros(len(around) * plain.N_LAYERS, np.int64)
     for k in range(1, len(around)):
-        own = sums[k * N_LAYERS : (k + 1) * N_LAYERS]
+        own = sums[k * plain.N_LAYERS : (k + 1) * plain.N_LAYERS]
         for n in range(9):
-            first = around[k, n] * N_LAYERS
-            beside = votes[first : first + N_LAYERS]
-            for layer in range(N_LAYERS):
+            first = around[k, n] * plain.N_LAYERS
+            beside = votes[first : first + plain.N_LAYERS]
+            for layer in range(plain.N_LAYERS):
                 own[layer] += beside[layer]
     return sums

@@ -15,12 +15,7 @@ from gp_ground_seg.core.frame import (
     Tiles,
 )
 from gp_ground_seg.core.jit import jit
-from gp_ground_seg.core.pipeline.polar_grid import (
-    BinLookup,
-    GridGeometry,
-    azimuth_key,
-    vertical_density,
-)
+from gp_ground_seg.core.pipeline import polar_grid as plain
 
 BLOCK = 2048
 """Points sorted at a time, so that their intermediate values stay in the nearest caches."""
@@ -29,7 +24,7 @@ BLOCK = 2048
 @jit(entry=True)
 def build_grid(
     columns: PointArray,
-    geometry: GridGeometry,
+    geometry: plain.GridGeometry,
     min_extent: float,
     grid: PolarGrid,
     tiles: Tiles,
@@ -74,7 +69,7 @@ def _compute_range(
     x: PointArray,
     y: PointArray,
     z: PointArray,
-    ranges: BinLookup,
+    ranges: plain.BinLookup,
     r: PointArray,
     entry: CellArray,
     cell: CellArray,
@@ -98,7 +93,7 @@ def _compute_range(
 def _compute_azimuth_key(
     x: PointArray,
     y: PointArray,
-    geometry: GridGeometry,
+    geometry: plain.GridGeometry,
     cell: CellArray,
     key: PointArray,
     entry: CellArray,
@@ -114,7 +109,7 @@ def _compute_azimuth_key(
         inside = cell[i] == 0
         x_i = x[i] if inside else zero
         y_i = y[i] if inside else zero
-        key_i = azimuth_key(x_i, y_i, number)
+        key_i = plain.azimuth_key(x_i, y_i, number)
         # Exactly 4 is the edge that ends the last segment: that is segment 0 again.
         key_i = key_i if key_i < four else zero
         key[i] = key_i
@@ -126,7 +121,7 @@ def _compute_azimuth_key(
 
 @jit()
 def _look_up(
-    geometry: GridGeometry,
+    geometry: plain.GridGeometry,
     r: PointArray,
     range_entry: CellArray,
     key: PointArray,
@@ -228,7 +223,7 @@ def _take_candidates(
             candidates.z[c], candidates.r[c], candidates.bin[c] = low, extremes[k, 1], n
             candidates.tile[c] = numbers[k, 1]
             candidates.x[c], candidates.y[c] = extremes[k, 3], extremes[k, 4]
-            candidates.density[c] = vertical_density(
+            candidates.density[c] = plain.vertical_density(
                 count, edges[n + 1] - edges[n], low, high, min_extent
             )
             c += 1

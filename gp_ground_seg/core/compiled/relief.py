@@ -17,23 +17,9 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig
-from gp_ground_seg.core.pipeline.relief import (
-    FADED,
-    MIN_WEIGHT,
-    N_ROUNDS,
-    N_SIDES,
-    faded,
-    from_first_middle,
-    height_in,
-    height_of,
-    middle_of,
-    piece_of,
-    plane_of,
-    robust_weight,
-    square_of,
-)
+from gp_ground_seg.core.pipeline import relief as plain
 
-_WIDTH = N_SIDES + 2
+_WIDTH = plain.N_SIDES + 2
 _N_SQUARES = _WIDTH * _WIDTH
 _N_SUMS = 9
 
@@ -54,19 +40,19 @@ def find_relief(
     """
     reached = reachable(candidates, faces, height, growth, stands)
     terrain, is_known = _fit_planes(candidates, reached, height)
-    if (np.abs(terrain) <= FADED).all():
+    if (np.abs(terrain) <= plain.FADED).all():
         return
     _fill(terrain, is_known)
-    high = faded(terrain).reshape(_WIDTH, _WIDTH)[1:-1, 1:-1]
-    for i in range(N_SIDES - 1):
-        for j in range(N_SIDES - 1):
+    high = plain.faded(terrain).reshape(_WIDTH, _WIDTH)[1:-1, 1:-1]
+    for i in range(plain.N_SIDES - 1):
+        for j in range(plain.N_SIDES - 1):
             a, b, c, d = high[i, j], high[i + 1, j], high[i, j + 1], high[i + 1, j + 1]
-            for k, value in enumerate(piece_of(a, b, c, d)):
+            for k, value in enumerate(plain.piece_of(a, b, c, d)):
                 pieces[i, j, k] = value
     for k in range(len(z)):
-        u = from_first_middle(candidates.x[k], np.float64)
-        v = from_first_middle(candidates.y[k], np.float64)
-        z[k] = candidates.z[k] - height_in(pieces[np.uintp(u), np.uintp(v)], u, v)
+        u = plain.from_first_middle(candidates.x[k], np.float64)
+        v = plain.from_first_middle(candidates.y[k], np.float64)
+        z[k] = candidates.z[k] - plain.height_in(pieces[np.uintp(u), np.uintp(v)], u, v)
 
 
 @jit()
@@ -74,9 +60,9 @@ def find_places(
     x: PointArray, y: PointArray, u: PointArray, v: PointArray, piece: CellArray
 ) -> None:
     """Set `u`, `v` and the piece, counted over all, of places (P,) [m], in a loop of vectors."""
-    n, number = np.int32(N_SIDES - 1), x.dtype.type
+    n, number = np.int32(plain.N_SIDES - 1), x.dtype.type
     for i in range(len(x)):
-        u[i], v[i] = from_first_middle(x[i], number), from_first_middle(y[i], number)
+        u[i], v[i] = plain.from_first_middle(x[i], number), plain.from_first_middle(y[i], number)
         piece[i] = np.int32(u[i]) * n + np.int32(v[i])
 
 
@@ -96,30 +82,32 @@ def _fit_planes(
     x, y, z = candidates.x, candidates.y, candidates.z
     square, number = np.empty(len(x), np.int64), np.zeros(_N_SQUARES, np.int64)
     for c in range(len(x)):
-        square[c] = _place(int(square_of(x[c])), int(square_of(y[c])))
+        square[c] = _place(int(plain.square_of(x[c])), int(plain.square_of(y[c])))
         number[square[c]] += reached[c]
     weight, plane = np.empty(len(x)), np.zeros((_N_SQUARES, 5))
     for c in range(len(x)):
         weight[c] = 1.0 / number[square[c]] if reached[c] else 0.0
     terrain, is_known = np.zeros(_N_SQUARES), np.zeros(_N_SQUARES, np.bool_)
-    for _ in range(N_ROUNDS):
+    for _ in range(plain.N_ROUNDS):
         sums = _sums_around(x, y, z, height, weight, square)
         for k in range(_N_SQUARES):
             if number[k] > 0:
                 # Element by element: assigned tuples take seconds to compile.
-                for i, value in enumerate(plane_of(sums[k])):
+                for i, value in enumerate(plain.plane_of(sums[k])):
                     plane[k, i] = value
         for c in range(len(x)):
             if reached[c]:
-                there = height_of(plane[square[c]], x[c], y[c])
-                weight[c] = robust_weight(z[c] + height - there) / number[square[c]]
-    for i in range(N_SIDES):
-        for j in range(N_SIDES):
+                there = plain.height_of(plane[square[c]], x[c], y[c])
+                weight[c] = plain.robust_weight(z[c] + height - there) / number[square[c]]
+    for i in range(plain.N_SIDES):
+        for j in range(plain.N_SIDES):
             k = _place(i, j)
             # Most squares have no terrain about them.
-            if sums[k, 0] >= MIN_WEIGHT:
+            if sums[k, 0] >= plain.MIN_WEIGHT:
                 is_known[k] = True
-                terrain[k] = height_of(plane_of(sums[k]), middle_of(i), middle_of(j))
+                terrain[k] = plain.height_of(
+                    plain.plane_of(sums[k]), plain.middle_of(i), plain.middle_of(j)
+                )
     return terrain, is_known
 
 
@@ -160,8 +148,8 @@ def _sums_around(
 def _fill(terrain: FloatArray, is_known: BoolArray) -> None:
     """See the plain `filled`; unknown heights are 0 before."""
     is_waiting, mean = np.zeros(_N_SQUARES, np.bool_), np.empty(_N_SQUARES)
-    for i in range(N_SIDES):
-        for j in range(N_SIDES):
+    for i in range(plain.N_SIDES):
+        for j in range(plain.N_SIDES):
             is_waiting[_place(i, j)] = not is_known[_place(i, j)]
     ring = np.flatnonzero(is_known)
     while len(ring) > 0:

@@ -11,19 +11,9 @@ import numpy as np
 
 from gp_ground_seg.core.frame import BoolArray, CellArray, FloatArray, IntArray, Tiles
 from gp_ground_seg.core.jit import jit
-from gp_ground_seg.core.pipeline.roughness import (
-    MOST_OVER_WIDE,
-    N_LEVELS,
-    NEAR,
-    ROUGHNESS,
-    SQUARE_EDGES,
-    UNKNOWN,
-    UNKNOWN_LEVEL,
-    WIDE,
-    Window,
-)
+from gp_ground_seg.core.pipeline import roughness as plain
 
-N_WORDS = N_LEVELS // 8
+N_WORDS = plain.N_LEVELS // 8
 _ONES, _HIGHEST = np.uint64(0x0101010101010101), np.uint64(56)
 _LANES, _LOW_BYTES = np.uint64(0x0001000100010001), np.uint64(0x00FF00FF00FF00FF)
 
@@ -43,7 +33,7 @@ def set_roughness(
     `sums` (T + 1,) have the number of returns near the surface in the bits from `shift` on, and
     below the sum of their squared heights in `units` for 1 m^2; those of faces do not count.
     """
-    square, n_known = np.full(len(sums) - 1, UNKNOWN), 0
+    square, n_known = np.full(len(sums) - 1, plain.UNKNOWN), 0
     for t in range(len(square)):
         number = sums[t] >> shift
         if number > 0 and not is_face[t]:
@@ -51,34 +41,37 @@ def set_roughness(
             n_known += 1
     if n_known == 0:
         return
-    level, counts = levels_of(square, SQUARE_EDGES)
+    level, counts = levels_of(square, plain.SQUARE_EDGES)
     of_frame, n_sides = level_at(counts, n_known, 0.5), int(math.sqrt(len(tiles.at)))
-    near = levels_about(tiles.place, level, n_sides, NEAR, of_frame)
-    wide = levels_about(tiles.place, level, n_sides, WIDE, of_frame)
+    near = levels_about(tiles.place, level, n_sides, plain.NEAR, of_frame)
+    wide = levels_about(tiles.place, level, n_sides, plain.WIDE, of_frame)
     for t in range(len(level)):
-        most = MOST_OVER_WIDE * ROUGHNESS[np.uintp(wide[t])]
-        roughness[t] = min(ROUGHNESS[np.uintp(near[t])], most)
+        most = plain.MOST_OVER_WIDE * plain.ROUGHNESS[np.uintp(wide[t])]
+        roughness[t] = min(plain.ROUGHNESS[np.uintp(near[t])], most)
 
 
 @jit()
 def levels_of(square: FloatArray, edges: FloatArray) -> tuple[CellArray, IntArray]:
     """Level of each square between the `edges`, or `UNKNOWN_LEVEL`, and how many have each."""
-    level, counts = np.full(len(square), UNKNOWN_LEVEL, np.int32), np.zeros(N_LEVELS, np.int64)
+    level, counts = (
+        np.full(len(square), plain.UNKNOWN_LEVEL, np.int32),
+        np.zeros(plain.N_LEVELS, np.int64),
+    )
     for k in range(len(square)):
-        level[k] += np.int32(square[k] != UNKNOWN)
+        level[k] += np.int32(square[k] != plain.UNKNOWN)
     # Edge by edge, as the inner loop has vector instructions.
     for edge in edges:
         for k in range(len(square)):
             level[k] += np.int32(square[k] >= edge)
     for k in range(len(square)):
-        if level[k] != UNKNOWN_LEVEL:
+        if level[k] != plain.UNKNOWN_LEVEL:
             counts[np.uintp(level[k])] += 1
     return level, counts
 
 
 @jit()
 def levels_about(
-    place: CellArray, level: CellArray, n_sides: int, window: Window, prior_level: int
+    place: CellArray, level: CellArray, n_sides: int, window: plain.Window, prior_level: int
 ) -> CellArray:
     """See the plain `levels_about`."""
     shift, n_rows = window.shift, 1
@@ -101,7 +94,7 @@ def levels_about(
     # the sums.
     counts = np.zeros(n_rows * N_WORDS, np.uint64)
     for k in range(len(place)):
-        if level[k] != UNKNOWN_LEVEL:
+        if level[k] != plain.UNKNOWN_LEVEL:
             counts[np.uintp(own[k] * N_WORDS + level[k] // 8)] += _byte(1, level[k])
     prior, level_of_row = np.zeros(N_WORDS, np.uint64), np.empty(n_rows, np.int32)
     prior[prior_level // 8] = _byte(window.prior, prior_level)

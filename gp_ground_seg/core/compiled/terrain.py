@@ -8,27 +8,7 @@ import numpy as np
 from gp_ground_seg.core.frame import BoolArray, Candidates, Faces, FloatArray, IntArray
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig
-from gp_ground_seg.core.pipeline.terrain import (
-    EVEN,
-    MIN_ENTRY,
-    MIN_SEEDS,
-    MIN_WIDTH,
-    N_ASIDE,
-    OBLIQUE,
-    OWN,
-    RAISED,
-    REACH,
-    STEEP,
-    arc_of,
-    can_step,
-    falls,
-    gentle,
-    goes_on,
-    has_few_entries,
-    hides,
-    largest_gap,
-    longest_gap,
-)
+from gp_ground_seg.core.pipeline import terrain as plain
 
 
 class _Walk(NamedTuple):
@@ -54,10 +34,11 @@ def reachable(
     walk = _Walk(parent, marks[0], part, even, marks[1], marks[2])
     for c in range(n):
         tile = np.uintp(candidates.tile[c])
-        allowed[c], is_steep[c] = r[c] < REACH and not faces.is_face[tile], faces.is_steep[tile]
-        walk.is_raised[c] = allowed[c] and candidates.z[c] + height > RAISED
+        allowed[c] = r[c] < plain.REACH and not faces.is_face[tile]
+        is_steep[c] = faces.is_steep[tile]
+        walk.is_raised[c] = allowed[c] and candidates.z[c] + height > plain.RAISED
     steep, down = _step_along(candidates, allowed, is_steep, walk)
-    for aside in range(1, N_ASIDE + 1):
+    for aside in range(1, plain.N_ASIDE + 1):
         _step_aside(candidates, allowed, is_steep, aside, walk)
     _step_in_front(candidates, steep, walk)
     _step_in_front(candidates, down, walk)
@@ -70,7 +51,7 @@ def reachable(
         over = candidates.z[c] + height
         is_seed[c] = allowed[c] and r[c] < growth.seed_range
         is_seed[c] &= abs(over) < growth.seed_height_tolerance
-        is_own[c] = allowed[c] and over < OWN
+        is_own[c] = allowed[c] and over < plain.OWN
     result: BoolArray = is_terrain & _reached(parent, is_seed)
     is_even = _reached(even, is_own)
     for m in range(len(candidates.offsets) - 1):
@@ -78,7 +59,7 @@ def reachable(
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
             sees_own |= is_own[c]
             if not (sees_own or is_even[c]):
-                stands[c] |= hides(r[c], candidates.z[c] + height, result[c], growth)
+                stands[c] |= plain.hides(r[c], candidates.z[c] + height, result[c], growth)
     return result
 
 
@@ -89,7 +70,7 @@ def _reached(parent: IntArray, is_seed: BoolArray) -> BoolArray:
     for c in range(len(parent)):
         parent[c] = _root(parent, c)
         n_seeds[parent[c]] += is_seed[c]
-    result: BoolArray = n_seeds[parent] >= MIN_SEEDS
+    result: BoolArray = n_seeds[parent] >= plain.MIN_SEEDS
     return result
 
 
@@ -114,7 +95,7 @@ def _leave_out_not_entered(
     for m in range(len(offsets) - 1):
         sees_lower = False
         for c in range(offsets[m + 1] - 1, offsets[m] - 1, -1):
-            is_near = c > offsets[m] and r[c] - r[c - 1] <= largest_gap(r[c])
+            is_near = c > offsets[m] and r[c] - r[c - 1] <= plain.largest_gap(r[c])
             is_foot = is_near and _root(walk.part, c) != _root(walk.part, c - 1)
             is_before[c] = sees_lower and walk.is_raised[c] and is_foot
             sees_lower |= is_terrain[c] and not walk.is_raised[c]
@@ -123,8 +104,8 @@ def _leave_out_not_entered(
     for c in range(len(is_terrain)):
         if walk.is_raised[c]:
             part = _root(walk.part, c)
-            is_terrain[c] = entry[part] >= MIN_ENTRY
-            stands[c] = has_few_entries(entry[part], before[part])
+            is_terrain[c] = entry[part] >= plain.MIN_ENTRY
+            stands[c] = plain.has_few_entries(entry[part], before[part])
 
 
 @jit()
@@ -141,7 +122,7 @@ def _widths(candidates: Candidates, part: IntArray, marked: BoolArray) -> FloatA
                 root = _root(part, c)
                 # One more than the segment, as 0 is none.
                 if last[root] != m + 1:
-                    width[root] += arc_of(r[c], len(offsets) - 1)
+                    width[root] += plain.arc_of(r[c], len(offsets) - 1)
                     last[root] = m + 1
     return width
 
@@ -164,16 +145,16 @@ def _step_along(
                 continue
             over_steep = is_steep[c - 1] or is_steep[c]
             is_taken = False
-            if dr <= largest_gap(r[c]):
-                if can_step(dr, rise, EVEN):
+            if dr <= plain.largest_gap(r[c]):
+                if plain.can_step(dr, rise, plain.EVEN):
                     _join(walk.even, c - 1, c)
-                if can_step(dr, rise, gentle(over_steep)):
+                if plain.can_step(dr, rise, plain.gentle(over_steep)):
                     _step(walk, c - 1, c)
                     continue
-                is_taken = can_step(dr, rise, STEEP)
-            if not is_taken and dr <= longest_gap(r[c]):
+                is_taken = plain.can_step(dr, rise, plain.STEEP)
+            if not is_taken and dr <= plain.longest_gap(r[c]):
                 is_taken = _goes_on(candidates, offsets[m], c)
-            walk.is_fallen[c] = not is_taken and falls(dr, rise)
+            walk.is_fallen[c] = not is_taken and plain.falls(dr, rise)
             is_end[c] = is_taken and not over_steep
             is_end_down[c] = walk.is_fallen[c] or (is_end[c] and rise < 0.0)
     return np.flatnonzero(is_end), np.flatnonzero(is_end_down)
@@ -189,7 +170,7 @@ def _goes_on(candidates: Candidates, first: int, c: int) -> bool:
     if before < first:
         return False
     slope_before = (z[c - 1] - z[before]) / (r[c - 1] - r[before])
-    return bool(goes_on((z[c] - z[c - 1]) / dr, slope_before))
+    return bool(plain.goes_on((z[c] - z[c - 1]) / dr, slope_before))
 
 
 @jit()
@@ -202,19 +183,19 @@ def _step_in_front(candidates: Candidates, steep: IntArray, walk: _Walk) -> None
     starts = np.searchsorted(steep, offsets)
     segment = np.searchsorted(offsets, steep, side='right') - 1
     front = np.arange(len(steep))
-    for aside in range(1, N_ASIDE + 1):
+    for aside in range(1, plain.N_ASIDE + 1):
         for k in range(len(steep)):
             beside = (segment[k] + aside) % n_segments
-            gap = OBLIQUE * aside * arc_of(candidates.r[steep[k] - 1], n_segments)
+            gap = plain.OBLIQUE * aside * plain.arc_of(candidates.r[steep[k] - 1], n_segments)
             _join_front(candidates, steep, k, gap, starts[beside : beside + 2], front)
     width, newest = np.zeros(len(steep)), np.full(len(steep), -1)
     for k in range(len(steep)):
         front[k] = _root(front, k)
         if newest[front[k]] != segment[k]:
             newest[front[k]] = segment[k]
-            width[front[k]] += arc_of(candidates.r[steep[k] - 1], n_segments)
+            width[front[k]] += plain.arc_of(candidates.r[steep[k] - 1], n_segments)
     for k in range(len(steep)):
-        is_wide = width[front[k]] >= MIN_WIDTH
+        is_wide = width[front[k]] >= plain.MIN_WIDTH
         if walk.is_fallen[steep[k]]:
             walk.is_fallen[steep[k]] = is_wide
         elif is_wide:
@@ -254,7 +235,7 @@ def _step_aside(
                 behind += 1
             if not allowed[c]:
                 continue
-            across, gap = aside * arc_of(r[c], n_segments), 0.5 * largest_gap(r[c])
+            across, gap = aside * plain.arc_of(r[c], n_segments), 0.5 * plain.largest_gap(r[c])
             for there in range(max(behind - 1, first), min(behind + 1, stop)):
                 dr = abs(r[there] - r[c])
                 # Most are joined already; of raised ones it also matters what leads to them.
@@ -265,10 +246,10 @@ def _step_aside(
                 if allowed[there] and dr <= gap:
                     distance = math.sqrt(dr * dr + across * across)
                     rise = z[there] - z[c]
-                    if can_step(distance, rise, EVEN):
+                    if plain.can_step(distance, rise, plain.EVEN):
                         _join(walk.even, c, there)
                     over_steep = is_steep[c] or is_steep[there]
-                    if can_step(distance, rise, gentle(over_steep)):
+                    if plain.can_step(distance, rise, plain.gentle(over_steep)):
                         _step(walk, c, there)
 
 

@@ -12,27 +12,8 @@ from gp_ground_seg.core.compiled.roughness import level_at, levels_about, levels
 from gp_ground_seg.core.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Scan, Tiles
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import FacesConfig, LabelConfig
+from gp_ground_seg.core.pipeline import vertical_faces as plain
 from gp_ground_seg.core.pipeline.roughness import UNKNOWN_LEVEL
-from gp_ground_seg.core.pipeline.vertical_faces import (
-    FIRST,
-    OWN_SHARE,
-    SCATTER,
-    SCATTERED,
-    SQUARE_SCATTERS,
-    SUMS,
-    face_height,
-    in_units,
-    is_base_occluded,
-    is_beyond_edge,
-    is_examined,
-    is_flat,
-    is_steep,
-    is_vertical,
-    scatter_square,
-    slope_square,
-    smooth_up_to,
-    vote_on_scatter,
-)
 
 
 @jit(entry=True)
@@ -46,26 +27,28 @@ def find_faces(
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
             cell, t = m * n_bins + candidates.bin[c], candidates.tile[c]
             is_foot = candidates.z[c] - np.float64(tiles.extremes[t, 0]) <= tolerance
-            shows_ground[t] |= is_foot and is_flat(scan.extent[cell], tolerance)
+            shows_ground[t] |= is_foot and plain.is_flat(scan.extent[cell], tolerance)
     tall, number = _select_tall(tiles, height, label)
     sums = _sum_returns(scan.xyz, tiles, tall, config.cell_size, height, label, number)
-    whole = np.empty((len(tall), SUMS))
+    whole = np.empty((len(tall), plain.SUMS))
     for k in range(len(tall)):
         t, low, high = np.uintp(tall[k]), sums[2 * k], sums[2 * k + 1]
-        for i in range(SUMS):
+        for i in range(plain.SUMS):
             whole[k, i] = low[i] + high[i]
         extent = np.float64(tiles.extremes[t, 1]) - np.float64(tiles.extremes[t, 0])
-        if extent > face_height(label):
-            faces.is_face[t] = is_face = is_vertical(whole[k], config)
-            faces.is_steep[t] = is_steep(high)
-            is_occluded = is_face and not shows_ground[t] and is_base_occluded(low, high, config)
+        if extent > plain.face_height(label):
+            faces.is_face[t] = is_face = plain.is_vertical(whole[k], config)
+            faces.is_steep[t] = plain.is_steep(high)
+            is_occluded = (
+                is_face and not shows_ground[t] and plain.is_base_occluded(low, high, config)
+            )
             faces.has_occluded_base[t] = is_occluded
     _mark_scattered(tiles, tall, whole, height, label, faces)
     for m in range(len(candidates.offsets) - 1):
         before = 0.0
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
             r, tile = candidates.r[c], candidates.tile[c]
-            if is_beyond_edge(r - before, r, candidates.z[c] + height, label):
+            if plain.is_beyond_edge(r - before, r, candidates.z[c] + height, label):
                 faces.has_occluded_base[tile] = faces.is_face[tile]
             before = r
 
@@ -83,7 +66,7 @@ def _mark_scattered(
 
     The first rows of `sums` become those of the raised tiles.
     """
-    n, n_own, face, n_sides = 0, 0, face_height(label), int(math.sqrt(len(tiles.at)))
+    n, n_own, face, n_sides = 0, 0, plain.face_height(label), int(math.sqrt(len(tiles.at)))
     raised, own, square = np.empty_like(tall), np.empty(len(tall)), np.empty(len(tall))
     for k in range(len(tall)):
         t = np.uintp(tall[k])
@@ -91,22 +74,24 @@ def _mark_scattered(
         if faces.is_face[t]:
             continue
         if low + height > 0.5 * face:
-            raised[n], square[n] = t, scatter_square(sums[k])
-            for i in range(np.uintp(SUMS)):
+            raised[n], square[n] = t, plain.scatter_square(sums[k])
+            for i in range(np.uintp(plain.SUMS)):
                 sums[n, i] = sums[k, i]
             n += 1
         elif low + height > -0.5 * face and high - low <= face:
-            own[n_own] = scatter_square(sums[k])
+            own[n_own] = plain.scatter_square(sums[k])
             n_own += 1
-    _, counts = levels_of(own[:n_own], SQUARE_SCATTERS)
-    limit = smooth_up_to(SCATTER[level_at(counts, counts.sum(), OWN_SHARE)])
+    _, counts = levels_of(own[:n_own], plain.SQUARE_SCATTERS)
+    limit = plain.smooth_up_to(plain.SCATTER[level_at(counts, counts.sum(), plain.OWN_SHARE)])
     place, level = tiles.place[raised[:n]], np.empty(n, np.int32)
     block, places, blocks, small = _merged(place, n_sides, sums[:n])
     wide_block, _, _, large = _merged(places, (n_sides + 1) // 2, blocks)
     for k in range(n):
         b = np.uintp(block[k])
-        level[k] = vote_on_scatter(square[k], small[b], large[np.uintp(wide_block[b])], limit)
-    about = levels_about(place, level, n_sides, SCATTERED, 0)
+        level[k] = plain.vote_on_scatter(
+            square[k], small[b], large[np.uintp(wide_block[b])], limit
+        )
+    about = levels_about(place, level, n_sides, plain.SCATTERED, 0)
     for k in range(n):
         over = np.float64(tiles.extremes[raised[k], 0]) + height
         if level[k] != UNKNOWN_LEVEL and about[k] > 0 and over > face:
@@ -133,10 +118,10 @@ def _merged(
             places[n], number[at] = at, n + 1
             n += 1
         block[k] = own = np.uintp(number[at] - 1)
-        for i in range(np.uintp(SUMS)):
+        for i in range(np.uintp(plain.SUMS)):
             blocks[own, i] += sums[k, i]
     for b in range(n):
-        square[b] = slope_square(blocks[b])
+        square[b] = plain.slope_square(blocks[b])
     return block, places[:n], blocks[:n], square
 
 
@@ -147,7 +132,7 @@ def _select_tall(tiles: Tiles, height: float, label: LabelConfig) -> tuple[CellA
     tall, number = np.empty(n_tiles, np.int32), np.full(n_tiles, OUTSIDE, np.int32)
     for t in range(n_tiles):
         low, high = np.float64(extremes[t, 0]), np.float64(extremes[t, 1])
-        if is_examined(high - low, low + height, tiles.place[t], label):
+        if plain.is_examined(high - low, low + height, tiles.place[t], label):
             tall[n_tall], number[t] = t, n_tall
             n_tall += 1
     return tall[:n_tall], number
@@ -164,15 +149,15 @@ def _sum_returns(
     number: CellArray,
 ) -> FloatArray:
     """Sum over the lowest returns, (3, N), of tall tiles, and over those above: (2 * K, SUMS)."""
-    n_sides, sums = int(math.sqrt(len(tiles.at))), np.zeros((2 * len(tall), SUMS))
+    n_sides, sums = int(math.sqrt(len(tiles.at))), np.zeros((2 * len(tall), plain.SUMS))
     half, origin = 0.5 * n_sides * tile_size, np.empty((len(tall), 3))
     for k in range(len(tall)):
         place = tiles.place[tall[k]]
         # A division of whole numbers takes longer.
         column = np.int32((place + 0.5) / n_sides)
         # About a point near the tile: about the sensor, rounding would exceed the scatter.
-        origin[k, 0] = in_units((column & FIRST) * tile_size - half)
-        origin[k, 1] = in_units((place - column * n_sides & FIRST) * tile_size - half)
+        origin[k, 0] = plain.in_units((column & plain.FIRST) * tile_size - half)
+        origin[k, 1] = plain.in_units((place - column * n_sides & plain.FIRST) * tile_size - half)
         origin[k, 2] = tiles.extremes[tall[k], 0]
     foot_height, max_height = label.ground_tolerance, label.obstacle_max_height
     x, y, z, tile = columns[0], columns[1], columns[2], tiles.tile
@@ -186,9 +171,9 @@ def _sum_returns(
         above = np.float64(z[i]) - origin[own, 2]
         if above > max_height:
             continue
-        dx = in_units(np.float64(x[i]) - origin[own, 0])
-        dy = in_units(np.float64(y[i]) - origin[own, 1])
-        dz = in_units(np.float64(z[i]) + height)
+        dx = plain.in_units(np.float64(x[i]) - origin[own, 0])
+        dy = plain.in_units(np.float64(y[i]) - origin[own, 1])
+        dz = plain.in_units(np.float64(z[i]) + height)
         # No branch: whether a return is one of the lowest is unpredictable.
         s = sums[np.uintp(2 * k + np.int32(above > foot_height))]
         s[0] += 1.0
