@@ -31,7 +31,7 @@ from gp_ground_seg.lab.simulation import terrain as landforms
 from gp_ground_seg.lab.simulation.objects import floating_box
 
 GATES = ('growth.max_std', 'growth.seed_height_tolerance', 'label.obstacle_min_height',
-         'observation.slope_drift')  # fmt: skip
+         'observation.sigma_n', 'observation.slope_drift')  # fmt: skip
 
 
 def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicle():

@@ -257,7 +257,7 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
     height of the sensor, for example 0.4 m: far from the last ring on the ground, a gate wider
     than that would accept trunks, persons and cars as ground.
 
-    These are the gates of the growth, the drift of slopes, the tolerance of ground and the least
+    These are gates of the growth, noise and drift of slopes, the tolerance of ground and the least
     height of obstacles; nothing for one as high as `REFERENCE_HEIGHT`, or not seen to be lower.
     """
     share = sensor_height_of(pose) / REFERENCE_HEIGHT
@@ -269,6 +269,7 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
         'growth.max_std',
         'label.ground_tolerance',
         'label.obstacle_min_height',
+        'observation.sigma_n',
         'observation.slope_drift',
     )
     least = {name: float(Config.find_spec(name).minimum or 0.0) for name in names}
