@@ -29,8 +29,8 @@ from gp_ground_seg.lab import simulation
 from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, VLP_16, Scene, objects
 from gp_ground_seg.lab.simulation import terrain as landforms
 
-GATES = ('growth.max_std', 'growth.seed_height_tolerance', 'label.obstacle_min_height',
-         'observation.slope_drift')  # fmt: skip
+GATES = {'growth.max_std': 1.0, 'growth.seed_height_tolerance': 1.0, 'observation.sigma_n': 0.5,
+         'label.obstacle_min_height': 1.0, 'observation.slope_drift': 1.0}  # fmt: skip
 
 
 def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicle():
@@ -47,8 +47,8 @@ def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicl
         if share == 1.0:
             assert own is config
             continue
-        for name in GATES:
-            assert own[name] == pytest.approx(share * config[name], rel=0.3)
+        for name, power in GATES.items():
+            assert own[name] == pytest.approx(share**power * config[name], rel=0.3)
         least = max(0.1 * share, sensor_pose.LEAST_TOLERANCE)
         assert own.label.ground_tolerance == pytest.approx(least, abs=0.005)
         # A smaller one that is given stays, and the paper's rule knows no height of the sensor.

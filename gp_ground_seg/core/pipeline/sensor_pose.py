@@ -257,8 +257,8 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
     height of the sensor, for example 0.4 m: far from the last ring on the ground, a gate wider
     than that would accept trunks, persons and cars as ground.
 
-    These are the gates of the growth, the drift of slopes, the tolerance of ground and the least
-    height of obstacles; nothing for one as high as `REFERENCE_HEIGHT`, or not seen to be lower.
+    These are gates of the growth, variance of noise, drift of slopes, tolerance of ground, height
+    of obstacles; nothing for one as high as `REFERENCE_HEIGHT`, or not seen to be lower.
     """
     share = sensor_height_of(pose) / REFERENCE_HEIGHT
     if share >= 1.0 or config.label.rule != 'roughness':
@@ -271,9 +271,10 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
         'label.obstacle_min_height',
         'observation.slope_drift',
     )
-    least = {name: float(Config.find_spec(name).minimum or 0.0) for name in names}
+    shares = dict.fromkeys(names, share) | {'observation.sigma_n': math.sqrt(share)}
+    least = {name: float(Config.find_spec(name).minimum or 0.0) for name in shares}
     least['label.ground_tolerance'] = min(LEAST_TOLERANCE, config.label.ground_tolerance)
-    return config.replace(**{name: max(share * config[name], least[name]) for name in names})
+    return config.replace(**{k: max(v * config[k], least[k]) for k, v in shares.items()})
 
 
 def sensor_height_of(pose: SensorPose) -> float:

@@ -116,8 +116,7 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     candidates = scan.candidates
     is_next = np.diff(candidates.segment, prepend=-1) == 0
     gap = candidates.r - np.where(is_next, np.roll(candidates.r, 1), 0.0)
-    is_beyond = is_beyond_edge(gap, candidates.r, candidates.z + height, label)
-    beyond = candidates.tile[is_beyond]
+    beyond = candidates.tile[is_beyond_edge(gap, candidates.r, candidates.z + height, label)]
     result.has_occluded_base[beyond] = result.is_face[beyond]
     return result
 
