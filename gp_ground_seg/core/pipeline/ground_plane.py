@@ -38,10 +38,9 @@ APART = 0.3
 OTHER_SHARE = 0.05
 """Score of another level, by points off the best one, over that of the best one from which it
 counts: little is seen of a path between platforms, or of the top of a dock."""
-TIGHT, UNCROSSED = 0.8, 0.25
+TIGHT = 0.8
 """Support of another level over the weights of all points within the tolerance, from which it may
-be the own one: desks and cars are of many heights. And score over support: decks of jetties have
-0.28 and more, the roofs of a jam, which rays pass between, up to 0.24."""
+be the own one: desks and cars are of many heights."""
 OWN = 0.3
 """`asideness` of another level, over that of the best one, below which it is the own one: 0.00 to
 0.27 on paths and docks."""
@@ -170,7 +169,7 @@ def own_level(
     other, score, support = best_of(others, cells, weight, OTHER_SHARE * best_score)
     from_other = np.abs(distance(x, y, z, other))
     whole = weight[from_other * inverse <= 1.0].sum()
-    if support > TIGHT * RESOLUTION * whole and score > UNCROSSED * support:
+    if support > TIGHT * RESOLUTION * whole:
         if asideness(cells, other, best) < OWN * asideness(cells, best, other):
             best, other, d, from_other = other, best, from_other, d
         inverse = inverse * (d <= from_other)
