@@ -25,6 +25,7 @@ from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_
 from gp_ground_seg.core.gp.learning import Learned
 from gp_ground_seg.core.parameters.config import Config, SensorConfig, config_of
 from gp_ground_seg.core.parameters.schema import NO_BOX
+from gp_ground_seg.core.pipeline import mirror_images
 from gp_ground_seg.core.pipeline.ground_plane import CLEAR_TILT
 from gp_ground_seg.core.pipeline.ground_view import (
     LOWER_ENDS,
@@ -39,13 +40,6 @@ from gp_ground_seg.core.pipeline.ground_view import (
     objection_to_ground,
 )
 from gp_ground_seg.core.pipeline.lowest_points import tolerance_at
-from gp_ground_seg.core.pipeline.mirror_images import (
-    MIRRORED,
-    MirrorImages,
-    find_mirror_images,
-    in_sight,
-    mirror_share,
-)
 from gp_ground_seg.core.pipeline.points import (
     ENOUGH_POINTS,
     angles_of,
@@ -250,7 +244,7 @@ class GroundSegmenter:
 
     def _level(
         self, xyz: PointArray, sensor: SensorConfig, timer: StageTimer, fallback: SensorPose | None
-    ) -> tuple[Scan, SensorPose, MirrorImages, Config]:
+    ) -> tuple[Scan, SensorPose, mirror_images.MirrorImages, Config]:
         """Scan in the level frame, about the sensor, with mirror images raised.
 
         Its angles are those given, estimated or of `fallback`.
@@ -271,7 +265,7 @@ class GroundSegmenter:
             scan = backend.build_grid(pose.level(about), config)
         if objection == LOWER_ENDS and pose.is_height_default:
             scan = scan._replace(candidates=scan.candidates.where(scan.candidates.r < 0.0))  # none
-        images = find_mirror_images(scan, pose, view)
+        images = mirror_images.find_mirror_images(scan, pose, view)
         if len(images.points) > 0:
             scan = images.left_out(backend.build_grid(images.raised(scan.xyz), config))
         timer.mark('pose')
@@ -292,7 +286,7 @@ class GroundSegmenter:
             below = below._replace(is_mirror=_is_mirror(below, scan))
             if below.is_dry:
                 return below
-        left = scan._replace(candidates=in_sight(scan.candidates))
+        left = scan._replace(candidates=mirror_images.in_sight(scan.candidates))
         for view in self._views(left):
             if _is_mirror(view, scan):
                 # Again, without the images that were lowest in their cells.
@@ -344,7 +338,11 @@ class GroundSegmenter:
 def _is_mirror(view: View, scan: Scan) -> bool:
     """Whether much of what is below a plane is the image of what is over it."""
     # In a frame that is steep to the plane, the lowest points are not those of the ground.
-    return view.is_whole and not view.is_steep and mirror_share(view.plane, scan) >= MIRRORED
+    return (
+        view.is_whole
+        and not view.is_steep
+        and mirror_images.mirror_share(view.plane, scan) >= mirror_images.MIRRORED
+    )
 
 
 def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[float, ...]:

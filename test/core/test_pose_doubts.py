@@ -26,9 +26,8 @@ from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.ground_view import LOWER_ENDS, UPRIGHT, View
 from gp_ground_seg.core.pipeline.sensor_pose import LITTLE_GROUND, LOW_GROUND, NO_HEIGHT
 from gp_ground_seg.lab import simulation
-from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, VLP_16, Scene
+from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, VLP_16, Scene, objects
 from gp_ground_seg.lab.simulation import terrain as landforms
-from gp_ground_seg.lab.simulation.objects import floating_box
 
 GATES = {'growth.max_std': 1.0, 'growth.seed_height_tolerance': 1.0, 'observation.sigma_n': 0.5,
          'label.obstacle_min_height': 1.0, 'observation.slope_drift': 1.0}  # fmt: skip
@@ -71,7 +70,7 @@ def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicl
 def desks(gap):
     """A room full of desks, 0.74 m high, but for a `gap` [m] that a robot stands in."""
     tops = [
-        floating_box(ROOM.terrain, sign * x, sign * y, (*size, 0.04), 0.7)
+        objects.floating_box(ROOM.terrain, sign * x, sign * y, (*size, 0.04), 0.7)
         for sign in (-1.0, 1.0)
         for x, y, size in ((0.5 * gap + 1.5, 0.0, (3.0, 8.0)), (0.0, 0.5 * gap + 1.5, (gap, 3.0)))
     ]
@@ -229,7 +228,7 @@ def test_a_sensor_that_looks_ahead_stands_on_the_level_that_ends_there(edge, dro
 
 
 JETTY = landforms.polyline(np.pi / 2, [(-2.0, -1.5), (-1.7, 0.0), (1.7, 0.0), (2.0, -1.5)])
-RAILS = tuple(floating_box(JETTY, 0.0, y, (40.0, 0.1, 0.08), 0.92) for y in (-1.6, 1.6))
+RAILS = tuple(objects.floating_box(JETTY, 0.0, y, (40.0, 0.1, 0.08), 0.92) for y in (-1.6, 1.6))
 UPWARDS = tuple(np.radians(np.linspace(52, -52, 64)))
 NEAR = [
     # Floors under a ceiling, also the little that is seen of a small room, and among desks.
