@@ -87,15 +87,14 @@ FEW_RINGS = np.concatenate([np.arange(3.0, 10.1, 0.5), np.arange(11.5, 30.0, 2.2
 
 
 @pytest.mark.parametrize(
-    ('rings', 'foot', 'first', 'last'), [(FEW_RINGS, 10, -6, 6), (RINGS, 18, 16, 48)]
+    ('rings', 'foot', 'first', 'last', 'least'),
+    [(FEW_RINGS, 10, -6, 6, 0.92), (RINGS, 18, 16, 48, 0.9)],
 )
-def test_hillsides_are_climbed_in_high_steps_and_past_the_sensor(
-    backend, rings, foot, first, last
-):
+def test_hillsides_are_climbed_beside_and_in_high_steps(backend, rings, foot, first, last, least):
     seen = candidates_on(bank(25, foot, 6.0), rings)
     seen = seen.where((seen.x < foot) | ((seen.y > first) & (seen.y < last)))
     over = backend.find_relief(seen, NO_FACES, HEIGHT, Config())[1]
-    assert np.mean(np.abs(over.z + HEIGHT)[over.x > foot + 4.0] < 0.3) > 0.9
+    assert np.mean(np.abs(over.z + HEIGHT)[over.x > foot + 4.0] < 0.3) > least
 
 
 @pytest.mark.parametrize(('at', 'depth', 'share'), [(5, 1.2, 0.95), (7.5, 2, 1), (10, 3, 1)])
