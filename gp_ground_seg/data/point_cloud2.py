@@ -128,7 +128,7 @@ def append_columns(
     step = _round_up(end, _ALIGNMENT)
     points = _view(cloud, f'V{cloud.point_step}')
     wide = np.zeros((points.size, step), dtype=np.uint8)
-    wide[:, : cloud.point_step].view(points.dtype)[:, 0] = points.reshape(-1)
+    wide[:, : cloud.point_step].view(points.dtype)[:] = points.reshape(-1, 1)
     with np.errstate(over='ignore', invalid='ignore'):
         for name, start, datatype in placed:
             column = wide[:, start : start + columns[name].itemsize].view(_code(cloud, datatype))

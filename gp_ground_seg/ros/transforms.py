@@ -163,9 +163,9 @@ def names_in(message: bytes) -> bytes:
 class FrameListener:
     """Listens to TF and to an IMU, as `config` asks.
 
-    `hold` takes clouds and passes them to `use` in their order: each as soon as transform and
-    orientation at its stamp are known, or after `MAX_WAIT`. One that would be refused then waits
-    on, up to `LONGEST_WAIT`: the node may be behind, or their sender. It does not block. What TF
+    `hold` takes clouds and passes them to `use`, those of a frame in their order: each as soon as
+    transform and orientation at its stamp are known, or after `MAX_WAIT`. One that would be
+    refused then waits on, up to `LONGEST_WAIT`: the node may be behind, or their sender. What TF
     and IMU have sent is taken when a cloud comes or waits, and read only next to the stamp of a
     cloud: to read a transform takes ten times as long as to take it.
     """
@@ -179,8 +179,9 @@ class FrameListener:
         self._buffer: Any = None
         self._not_yet: Any = ()  # what TF raises
         sources: list[tuple[Any, str, Callable[[bytes], None], QoSProfile]] = []
-        if self._imu:
-            sources += [(Imu, 'imu', self._take_imu, BEST_EFFORT)]  # takes from any publisher
+        if self._imu:  # takes from any publisher
+            keep = self._orientations.add
+            sources += [(Imu, 'imu', lambda m: keep(stamp_in(m, CDR_HEADER), m), BEST_EFFORT)]
         if (tf2 := find_module('tf2_ros')) is not None:
             self._not_yet, self._too_late = tf2.TransformException, tf2.ExtrapolationException
             # Without the node: given one, the buffer clears itself at jumps of the node's clock,
@@ -211,9 +212,6 @@ class FrameListener:
                 while (taken := source.handle.take_message(source.msg_type, True)) is not None:
                     source.callback(taken[0])
 
-    def _take_imu(self, message: bytes) -> None:
-        self._orientations.add(stamp_in(message, CDR_HEADER), message)
-
     def _take_tf(self, message: bytes) -> None:
         if names := names_in(message):
             self._transforms[names].add(stamp_in(message, FIRST_STAMP), message)
@@ -228,15 +226,15 @@ class FrameListener:
 
     def _review(self) -> None:
         self._take_all()
-        while self._waiting:
-            since, header, use = self._waiting[0]
-            found = self._find(header, time.monotonic() - since)
-            if found is None:
-                self._timer.reset()
-                return
-            self._waiting.popleft()
-            use(found)
-        self._timer.cancel()
+        held: set[str] = set()  # frames of clouds that wait on
+        for since, header, use in [*self._waiting]:
+            waited = time.monotonic() - since
+            if header.frame_id in held or not (found := self._find(header, waited)):
+                held.add(header.frame_id)
+            else:
+                self._waiting.remove((since, header, use))
+                use(found)
+        (self._timer.reset if held else self._timer.cancel)()
 
     def _find(self, header: Header, waited: float) -> Found | None:
         """Return the frames at the stamp of a cloud that has `waited` [s]; None to wait on.
@@ -306,9 +304,11 @@ class FrameListener:
         if self._buffer is None:
             raise PointCloudError(f'transform {way}: needs tf2_ros ({INSTALL_TF2})')
         # What TF interpolates between; for 0, its newest, any may be needed.
-        for kept in self._transforms.values():
+        for names, kept in [*self._transforms.items()]:
             for message in kept.read(stamp):
                 self._read(message)
+            if stamp - kept[-1][0] > 2 * KEPT_TIME:  # they come no more, and the last is read
+                del self._transforms[names]
         try:
             return self._buffer.lookup_transform(target, source, Time(nanoseconds=stamp))
         except self._not_yet as error:
@@ -317,7 +317,7 @@ class FrameListener:
             if isinstance(error, self._too_late) and stamp:
                 # The newest: a sensor is fixed to its vehicle.
                 return self._look_up(target, source, 0, way, is_exact)
-            raise PointCloudError(f'no transform {way}: {error}') from error
+            raise PointCloudError(f'no transform {way}: {str(error).strip()}') from error
 
     def time_jumped(self, seconds: float) -> None:
         """Forget all after a long jump back, also what was not taken yet."""
