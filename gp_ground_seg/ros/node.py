@@ -17,7 +17,7 @@ from typing import Any
 import rclpy
 from lifecycle_msgs.srv import ChangeState
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
@@ -66,8 +66,8 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NODE_NAME, **options)
-        self._library_log = ExitStack()
-        self._library_log.enter_context(errors.messages_passed_to(self._pass_on))
+        self._at_end = ExitStack()  # of what is not freed with a node of rclpy
+        self._at_end.enter_context(errors.messages_passed_to(self._pass_on))
         self._frames: FrameListener | None = None
         # A guard condition runs in the executor, between two callbacks.
         self._loaded = self.create_guard_condition(self._change_backend)
@@ -210,7 +210,7 @@ class GroundSegmentationNode(ConfiguredNode):
         if self._loader is not None:
             self._loader.close()
         super().destroy_node()
-        self._library_log.close()
+        self._at_end.close()
 
     def _on_time_jump(self, seconds: float) -> None:
         self._kept = KeptPose()
@@ -234,6 +234,7 @@ class ManagedNode(LifecycleNodeMixin, GroundSegmentationNode):  # type: ignore[m
     def __init__(self, **options: Any) -> None:
         GroundSegmentationNode.__init__(self, **options)
         LifecycleNodeMixin.__init__(self)
+        self._at_end.callback(self._state_machine.destroy_when_not_in_use)  # with its services
         # At an impossible transition rclpy's own callback raises, and the caller gets no answer.
         for service in self.services:
             if service.srv_type is ChangeState:
@@ -337,8 +338,6 @@ def _spin(node: GroundSegmentationNode, stop: StopRequest) -> None:
             # Python handles a signal after the wait, not within it. A wait of less than the time
             # between two clouds would end in vain before each.
             executor.spin_once(timeout_sec=0.25)
-        except ExternalShutdownException:
-            return
         except Exception as error:
             # Of a callback, or of rclpy itself: at a negative time on /clock, for example.
             if rclpy.ok():
@@ -359,6 +358,8 @@ def main(args: Sequence[str] | None = None, *, is_managed: bool = False) -> int:
             for line in unused_files(words, node.get_fully_qualified_name()):
                 node.get_logger().warning(line)
             _spin(node, stop)
+            if isinstance(node, ManagedNode) and rclpy.ok():
+                node._set_active(False)  # with its bond
             node.get_logger().info(f'ends: {node._diagnostics.summary()}')
         except errors.GroundSegError as error:
             problem = with_file(str(error), words)

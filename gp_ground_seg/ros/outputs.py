@@ -82,7 +82,7 @@ def ground_model_cloud(segmented: costmap.SegmentedCloud) -> PointCloud2:
     columns = *places, model.std, model.length_scale, model.knots, *pose, *model.origin
     with np.errstate(over='ignore'):
         points = np.stack(np.broadcast_arrays(*columns), axis=-1).astype('<f4')
-    message = PointCloud2(
+    return PointCloud2(
         header=segmented.cloud.header,
         height=n_segments,
         width=n_knots,
@@ -94,9 +94,8 @@ def ground_model_cloud(segmented: costmap.SegmentedCloud) -> PointCloud2:
         point_step=4 * len(MODEL_FIELDS),
         row_step=4 * len(MODEL_FIELDS) * n_knots,
         is_dense=bool(np.isfinite(points).all()),
+        data=message_data(points),
     )
-    message.data = message_data(points)
-    return message
 
 
 def read_ground_model(cloud: PointCloud2) -> GroundModel:

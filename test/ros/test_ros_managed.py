@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import signal
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -31,14 +32,14 @@ AT_ONCE = 2.5  # longest time to an answer [s]
 def link(tmp_path):
     """A `Link` to the process of a node, which ends without an error."""
     limits = {'diagnostics.stale_after': 0.5}
-    with ros.linked_process(tmp_path, limits, connected=False, start=ros.MANAGED) as (
-        process,
-        link,
-    ):
-        link.process = process
+    with ros.linked_process(tmp_path, limits, connected=False, start=ros.MANAGED) as (node, link):
+        link.process = node
         yield link
-        if process.popen.returncode is None:
-            process.end_well()
+        if node.popen.returncode is None:
+            node.end_well()
+        # What it offers ends with it, and is not listed for the 20 s of a lease.
+        service = f'{link.node_name}/get_state'
+        assert any(time.sleep(0.1) or not link.probe.count_services(service) for _ in range(100))
 
 
 def change(link, number=0, label=''):
@@ -86,19 +87,19 @@ def test_a_lifecycle_manager_hears_a_bond_while_the_node_is_active(link):
         times = [one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec for one in heard.messages]
         return len(times) > 2 and np.median(np.diff(times)) == pytest.approx(0.1, abs=0.05)
 
-    for n in (1, 2):
+    for n, end in enumerate((lambda: change(link, DEACTIVATE), link.process.end_well), 1):
         heard.messages.clear()
         change(link, ACTIVATE)
         # Nav2's manager waits half of its bond_timeout for the first that it hears.
         wait_for(is_regular, 'heartbeat every 0.1 s')
-        change(link, DEACTIVATE)
+        end()
         wait_for(lambda: not heard.messages[-1].active, 'end of the bond')
-        *beats, end = heard.messages
+        *beats, last = heard.messages
         assert all(beat.active for beat in beats)
         assert {one.id for one in heard.messages} == {NODE_NAME}
         instances |= {one.instance_id for one in heard.messages}
         assert len(instances) == n
-        assert end.heartbeat_period == pytest.approx(0.1) and end.heartbeat_timeout == 4.0
+        assert last.heartbeat_period == pytest.approx(0.1) and last.heartbeat_timeout == 4.0
     assert 'bond_timeout' not in link.process.log
 
 
