@@ -172,11 +172,9 @@ class GroundSegmenter:
         # 4. Relief of the terrain; lines along each segment, over it, without lowest points of
         #    faces with occluded base; pseudo-inputs. The prior mean is the ground near the sensor.
         relief, candidates, shown = backend.find_relief(scan.candidates, faces, height, config)
-        candidates, lines, pseudo, onward, land, in_face = backend.extract_lines(
-            candidates, faces, config
-        )
-        knots, prior_mean = scan.grid.edges, -height
-        frame = Frame(candidates, lines, pseudo, onward, land, in_face, knots, prior_mean)
+        found = backend.extract_lines(candidates, faces, config)
+        in_face = faces.is_face[found[0].tile]
+        frame = Frame(*found, in_face, knots=scan.grid.edges, prior_mean=-height)
         timer.mark('lines')
         # 5. Observation and latent process: hyper-parameters theta, inliers and surface.
         is_fixed = config.learning.mode == 'fixed'

@@ -18,7 +18,7 @@ def frame_of(xyz, config):
     scan = NumpyBackend().build_grid(np.asarray(xyz, dtype=float), config)
     faces = NumpyBackend().find_faces(scan, 1.73, config)
     found = NumpyBackend().extract_lines(scan.candidates, faces, config)
-    return Frame(*found, scan.grid.edges, prior_mean=-1.73)
+    return Frame(*found, faces.is_face[found[0].tile], scan.grid.edges, prior_mean=-1.73)
 
 
 def config_of(**changes):

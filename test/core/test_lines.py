@@ -16,7 +16,6 @@ from gp_ground_seg.core.pipeline.lines import deming_slope, differs_in_direction
 
 N_TILES = 50
 NO_FACES = Faces(*np.zeros((3, N_TILES), dtype=bool))
-FACES = NO_FACES._replace(is_face=np.arange(N_TILES) > 0)
 
 
 def candidates_of(r, z, density=None, offsets=None):
@@ -101,7 +100,6 @@ def test_lines_and_pseudo_inputs_are_the_reference(
                 assert value.dtype == other.dtype
                 np.testing.assert_allclose(value, other, rtol=1e-9, atol=1e-9, err_msg=name)
         np.testing.assert_array_equal(of_backend[3:5], found[0][3:5])
-        np.testing.assert_array_equal(of_backend[5], faces.is_face[kept.tile])
 
 
 # Heights of four candidates behind three of a level road, 4 m apart.
@@ -118,7 +116,7 @@ AHEAD = {
 @pytest.mark.parametrize(('ahead', 'is_followed'), AHEAD.values(), ids=AHEAD)
 def test_the_ground_carries_on_to_a_slope_and_not_to_a_step(backend, ahead, is_followed):
     candidates = candidates_of(5.0 + 4.0 * np.arange(7), np.r_[0, 0, 0, ahead], None, [0, 7, 7])
-    _, lines, _, onward, land, _ = backend.extract_lines(candidates, NO_FACES, Config())
+    _, lines, _, onward, land = backend.extract_lines(candidates, NO_FACES, Config())
     assert list(lines.start) == [0, 3, 7] and not land.any()
     rises_on = carries_on(ahead[0], 4.0, onward[3], land[3])
     assert (is_walkable(ahead[0], 4.0, 0.2) and (ahead[0] <= 0.0 or rises_on)) == is_followed
@@ -130,18 +128,16 @@ def test_the_ground_carries_on_to_a_slope_and_not_to_a_step(backend, ahead, is_f
 
 @pytest.mark.parametrize(
     ('number', 'place', 'n_land'),
-    [(11, (40.0, 0.0, 0), 0), (12, (40.0, 0.0, 0), 12), (22, (41.3, 0.5, 0), 22),
-     (22, (41.5, 0.0, 0), 18), (22, (40.0, 0.4, 0), 18), (22, (40.0, 0.0, 1), 18)],
+    [(11, (40.0, 0.0), 0), (12, (40.0, 0.0), 12), (22, (41.3, 0.5), 22), (22, (41.5, 0.0), 18),
+     (22, (40.0, 0.4), 18)],
 )  # fmt: skip
 def test_what_goes_on_aside_for_14_m_is_land(backend, number, place, n_land):
-    # Segments of 1.4 m past the end of the ring; the fourth has a place of its own, or a face.
-    table = np.zeros((180, 3))
+    # Segments of 1.4 m past the end of the ring; the fourth has a place of its own.
+    table = np.zeros((180, 2))
     table[np.arange(175, 175 + number) % 180, 0], table[178] = 40.0, place
-    (r, z, tile), is_there = table[table[:, 0] > 0.0].T, table[:, 0] > 0.0
-    candidates = candidates_of(r, z, None, np.append(0, np.cumsum(is_there)))._replace(
-        tile=tile.astype(np.int32)
-    )
-    assert backend.extract_lines(candidates, FACES, Config())[4].sum() == n_land
+    (r, z), is_there = table[table[:, 0] > 0.0].T, table[:, 0] > 0.0
+    candidates = candidates_of(r, z, None, np.append(0, np.cumsum(is_there)))
+    assert backend.extract_lines(candidates, NO_FACES, Config())[4].sum() == n_land
 
 
 def test_a_candidate_far_below_changes_no_line_of_other_segments(backend):

@@ -50,12 +50,12 @@ def find_lines(
     faces: Faces,
     config: Config,
     trace_lines: Callable[..., tuple[int, int]] | None = None,
-) -> tuple[Candidates, Lines, PseudoInputs, FloatArray, BoolArray, BoolArray]:
+) -> tuple[Candidates, Lines, PseudoInputs, FloatArray, BoolArray]:
     """Lines through the candidates that show ground, and what follows from the lines.
 
     The lowest point of a face with occluded base is no candidate. Returns the candidates kept,
-    lines, pseudo-inputs, how the ground goes on behind each, which are on land (`find_land`), and
-    which are in faces. `trace_lines` is `trace`, compiled.
+    lines, pseudo-inputs, how the ground goes on behind each, and which are on land (`find_land`).
+    `trace_lines` is `trace`, compiled.
     """
     candidates = candidates.where(~faces.has_occluded_base[candidates.tile])
     n = len(candidates.r)
@@ -65,22 +65,21 @@ def find_lines(
     groups: Any = tuple(
         map(numbers_of, (config.lines, config.growth, config.latent, config.length_scale))
     )
-    in_face, is_start = faces.is_face[candidates.tile], find_starts(candidates, config.lines)
+    is_start = find_starts(candidates, config.lines)
     n_lines, n = (trace_lines or _trace_at_once)(
-        candidates, is_start, in_face, groups, lines, pseudo, onward, land
+        candidates, is_start, groups, lines, pseudo, onward, land
     )
     lines = Lines(lines.line, lines.slope[:n_lines], lines.start[: n_lines + 1])
     offsets = np.searchsorted(lines.start[line[:n]], candidates.offsets)
     pseudo = PseudoInputs(pseudo.r_bar[:n], pseudo.log_extent[:n], offsets, line[:n], kind[:n])
     if config.learning.length_scale == 'classes':
         pseudo = shared_by_class(lines, pseudo, config.length_scale)
-    return candidates, lines, pseudo, onward, land, in_face
+    return candidates, lines, pseudo, onward, land
 
 
 def _trace_at_once(
     candidates: Candidates,
     is_start: BoolArray,
-    in_face: BoolArray,
     groups: Groups,
     lines: Lines,
     pseudo: PseudoInputs,
@@ -96,7 +95,7 @@ def _trace_at_once(
     lines.line[:] = np.repeat(np.arange(n_lines), size)
     lines.slope[:n_lines], lines.start[: n_lines + 1] = slope, start
     onward[:] = _onward(r, z, candidates.offsets[1:][candidates.segment], growth)
-    land[:] = _is_land(candidates, in_face, growth)
+    land[:] = _is_land(candidates, growth)
     number = np.maximum(np.rint(size / latent.candidates_per_pseudo_input).astype(np.int64), 1)
     line = np.repeat(np.arange(n_lines), number)
     n, rank = len(line), np.arange(len(line)) - (np.cumsum(number) - number)[line]
@@ -134,11 +133,10 @@ def _line_slopes(
     return slope[is_start[:-1]]
 
 
-def _is_land(candidates: Candidates, in_face: BoolArray, growth: GrowthConfig) -> BoolArray:
+def _is_land(candidates: Candidates, growth: GrowthConfig) -> BoolArray:
     """Do what `find_land` does."""
-    r, segment, n_segments = candidates.r, candidates.segment, candidates.n_segments
-    # Of one in a face the height is NaN, to which nothing goes on.
-    n, z = len(r), np.where(in_face, np.nan, candidates.z)
+    r, z, n = candidates.r, candidates.z, len(candidates.r)
+    segment, n_segments = candidates.segment, candidates.n_segments
     arc, number = 2.0 * math.pi / n_segments * r, np.zeros(n)
     # Segments first, then ranges: what is nearest in the next segment is nearest of all.
     share = 0.4 * r / r.max(initial=1.0)
@@ -216,7 +214,6 @@ def find_starts(candidates: Candidates, tolerances: LinesConfig) -> BoolArray:
 def trace(
     candidates: Candidates,
     is_start: BoolArray,
-    in_face: BoolArray,
     groups: Groups,
     lines: Lines,
     pseudo: PseudoInputs,
@@ -231,7 +228,7 @@ def trace(
     tolerances, growth, latent, limits = groups
     n_lines = extract_lines(candidates, is_start, tolerances, lines)
     find_onward(candidates, growth, onward)
-    find_land(candidates, in_face, growth, land)
+    find_land(candidates, growth, land)
     return n_lines, select_pseudo_inputs(candidates, lines, n_lines, latent, limits, pseudo)
 
 
@@ -393,14 +390,11 @@ def goes_aside(apart: Values, rise: Values, arc: Values, max_slope: float) -> Va
 
 
 @shared
-def find_land(
-    candidates: Candidates, in_face: BoolArray, growth: GrowthConfig, land: BoolArray
-) -> None:
+def find_land(candidates: Candidates, growth: GrowthConfig, land: BoolArray) -> None:
     """Set in `land` (C,) whether a candidate is of a surface too wide for an object: `WIDE` [m].
 
-    The surface continues in the nearest candidate of a neighbouring segment if neither is in a
-    face (`in_face`, (C,)), their ranges differ by no more than the arc between them, and their
-    heights by no more than those of ground.
+    The surface continues in the nearest candidate of a neighbouring segment if their ranges differ
+    by no more than the arc between them, and their heights by no more than those of ground.
     """
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     n_segments, number = len(offsets) - 1, np.zeros((2, len(r)))
@@ -412,8 +406,8 @@ def find_land(
             for c in range(offsets[m], offsets[m + 1]):
                 while near + 1 < stop and abs(r[near + 1] - r[c]) < abs(r[near] - r[c]):
                     near += 1
-                onto[c], is_any = -1, near < stop and not (in_face[c] or in_face[near])
-                if is_any and goes_aside(
+                onto[c] = -1
+                if near < stop and goes_aside(
                     r[near] - r[c], z[near] - z[c], angle * r[c], growth.max_slope
                 ):
                     onto[c] = near
