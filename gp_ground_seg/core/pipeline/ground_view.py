@@ -227,8 +227,7 @@ def _shows_lower_ends(view: View, scan: Scan) -> bool:
     n_flat = np.count_nonzero((extent > 0.0) & (extent <= LAYERS[2]))
     if n_flat >= MOST_FLAT * np.count_nonzero(extent):
         return False
-    low, high = np.quantile(height[is_on], (0.25, 0.75))
-    is_floor = view.is_surface or high - low <= FLOOR_SCATTER
+    is_floor = view.is_surface or np.ptp(np.quantile(height[is_on], (0.25, 0.75))) <= FLOOR_SCATTER
     return bool(not is_floor or (can_be_cut and _is_cut(scan)))
 
 

@@ -77,11 +77,12 @@ def reachable(
     steps, is_steep = _steps(candidates, allowed), faces.is_steep[candidates.tile]
     first, second, is_fall = steps.first, steps.second, steps.is_fall
     rise, is_near = candidates.z[second] - candidates.z[first], ~steps.is_long & ~is_fall
+    is_along = candidates.segment[second] == candidates.segment[first]
     over_steep = is_steep[first] | is_steep[second]
     taken, is_even, can_be = (
         is_near & can_step(steps.length, rise, most) for most in (gentle(over_steep), EVEN, STEEP)
     )
-    is_steep_step = ~(taken | over_steep) & (steps.is_long | (can_be & (second == first + 1)))
+    is_steep_step = ~(taken | over_steep) & (steps.is_long | (can_be & is_along))
     for wanted in (is_steep_step, is_fall | (is_steep_step & (rise < 0.0))):
         taken[wanted] |= _in_front(candidates, first[wanted])
     is_terrain, stands = _entered(candidates, allowed, steps, taken & ~is_fall)
