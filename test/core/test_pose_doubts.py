@@ -236,14 +236,14 @@ NEAR = [
     (SMALL_ROOM, simulation.SENSORS['mid-360'], 0.45, 0, 0.05),
     (CORRIDOR, simulation.SENSORS['mid-360'], 0.4, 1, 0.05),
     (desks(2.4), dataclasses.replace(SMALL_OS1, elevations=UPWARDS), 0.95, 0, 0.05),
-    # A narrow jetty is the ground; rails beside the sensor, and cars around, are not.
+    # A narrow jetty is the ground; rails beside the sensor, cars around or below, slopes are not.
     (Scene('rails', JETTY, RAILS), simulation.SENSORS['mid-360'], 1.0, 0, 0.05),
     *(
         (scene, sensor, height + more, 3, 0.05)
         for sensor, height in ((SMALL_VLP, 0.5), (SMALL_VLP, 1.0), (SMALL_OS1, 0.8))
         for scene, more in ((Scene('jetty', JETTY), 0.0), ('traffic_jam', 0.8))
     ),
-    # Nor is a slope nearby.
+    ('traffic_jam', SMALL_VLP, 3.1, 2, 0.15),
     *(
         (scene, sensor, height, 2, 0.15)
         for sensor, height in ((SMALL_HDL, 1.75), (SMALL_VLP, 0.8), (SMALL_OS1, 1.75))

@@ -41,9 +41,9 @@ counts: little is seen of a path between platforms, or of the top of a dock."""
 TIGHT = 0.8
 """Support of another level over the weights of all points within the tolerance, from which it may
 be the own one: desks and cars are of many heights."""
-OWN = 0.3
+OWN = 0.41
 """`asideness` of another level, over that of the best one, below which it is the own one: 0.00 to
-0.27 on paths and docks."""
+0.40 on paths and docks, mostly 0.43 and more of roofs in a jam."""
 STRAY = 0.05
 """Share of the points of a level that may lie farther in a direction than it reaches."""
 LEVEL, STRAIGHT = 1.15, 0.1
@@ -198,8 +198,7 @@ def hypotheses(cells: LowestPoints, max_slope: float) -> FloatArray:
     level = level[is_possible(level.T, max_slope)]
     tilted = tilted[is_possible(tilted.T, max_slope)]
     refine(cells.x, cells.y, cells.z, cells.inverse, tilted, max_slope, N_FIRST)
-    planes = np.concatenate((level, tilted))
-    return np.asarray(np.floor(planes / GRAIN + 0.5) * GRAIN)
+    return np.asarray(np.floor(np.concatenate((level, tilted)) / GRAIN + 0.5) * GRAIN)
 
 
 @shared
@@ -247,10 +246,12 @@ def asideness(cells: LowestPoints, own: Plane, other: Plane) -> float:
     It is the share of points of another level that lie in the convex hull of its own and the
     robot: a path has none between it and the platforms on both sides, and lies between these. 1 is
     added if the robot is not in the hull of its own points, and nearer to that of the other ones.
+    A point below it counts where its ray crosses it: on roofs between which a road is seen.
     """
-    x, y, z, inverse = cells.x, cells.y, cells.z, cells.inverse
-    d = np.abs(distance(x, y, z, own) * inverse)
-    from_other = np.abs(distance(x, y, z, other) * inverse)
+    over, inverse = distance(cells.x, cells.y, cells.z, own), cells.inverse
+    d = np.abs(over * inverse)
+    from_other = np.abs(distance(cells.x, cells.y, cells.z, other) * inverse)
+    x, y = crossing_of(cells.x, over, own), crossing_of(cells.y, over, own)
     is_own, is_other = (d <= 1.0) & (d <= from_other), (from_other <= 1.0) & (from_other < d)
     if not (is_own.any() and is_other.any()):
         return 1.0
@@ -260,9 +261,8 @@ def asideness(cells: LowestPoints, own: Plane, other: Plane) -> float:
         reach, reach_other = reach_of(along[is_own]), reach_of(along[is_other])
         is_between &= along <= max(reach, 0.0)
         nearest, nearest_other = min(nearest, reach), min(nearest_other, reach_other)
-    is_outside = nearest < min(nearest_other, 0.0)
     between, whole = cells.weight[is_between].sum(), cells.weight[is_other].sum()
-    return float(between / max(whole, 1.0) + is_outside)
+    return float(between / max(whole, 1.0) + (nearest < min(nearest_other, 0.0)))
 
 
 @shared
@@ -336,9 +336,9 @@ def support_by(
 def crossing_of(r: Values, height: Values, plane: Plane) -> Values:
     """Range at which the ray to a point that is so high over a plane crosses it [m].
 
-    A ray below the plane all the way, as that of a ceiling, is taken to cross it where it ends.
+    A ray on one side of it all the way, as that of a ceiling, is taken to cross it where it ends.
     """
-    return r * plane[0] / (plane[0] - height) if plane[0] > 0.0 else r
+    return r * plane[0] / (plane[0] - np.minimum(height, 0.0)) if plane[0] > 0.0 else r
 
 
 @shared
