@@ -97,10 +97,9 @@ def test_rounding_beside_little_noise_is_no_fault(backend):
     theta = given_theta(config)
     theta[1] = np.log(1e-5)
     surface, *_ = backend.estimate_surface(frame, theta, config)
-    m = frame.candidates.segment[0]
     assert surface.inlier.all()
     rounding = {'numpy': 1e-3, 'numba': 1e-2}[backend.name]
-    np.testing.assert_allclose(surface.mean[m], -1.73, atol=rounding)
+    np.testing.assert_allclose(surface.mean[frame.candidates.segment[0]], -1.73, atol=rounding)
 
 
 def test_a_segment_is_as_in_the_paper_in_the_frame_of_the_sensor():

@@ -8,7 +8,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from conftest import fewer, hilly_scan, run_python
+from conftest import fewer, hilly_scan, run_python, simulated
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
 from gp_ground_seg.core.backend import NumpyBackend
@@ -131,8 +131,7 @@ def test_arguments_that_are_refused(points, given, message):
 def test_order_and_layout_of_the_points_do_not_matter(backend, scan, dtype):
     segmenter = GroundSegmenter(CONFIG, backend=backend)
     scan[::50] = np.nan
-    points = scan.astype(dtype)
-    order = np.random.default_rng(0).permutation(len(points))
+    points, order = scan.astype(dtype), np.random.default_rng(0).permutation(len(scan))
     base, shuffled = segmenter.segment(points), segmenter.segment(points[order])
     for name in VALUES:
         np.testing.assert_array_equal(getattr(shuffled, name), getattr(base, name)[order])
@@ -284,3 +283,9 @@ may_end.set()
 
 def test_a_process_forked_while_another_thread_segments_segments_too():
     assert run_python(FORK) == ('7\n', '')
+
+
+def test_few_beams_tell_a_low_box_from_a_bump_where_the_road_is_smooth():
+    made = simulated('low_boxes', seed=7)
+    is_on_box = (made.object_id > 0) & (made.points[:, 2] > -0.7)
+    assert (GroundSegmenter().segment(made.points).label[is_on_box] == Label.GROUND).mean() < 0.13

@@ -15,21 +15,18 @@ from gp_ground_seg.core.parameters.config import ObservationConfig
 @compiled_form(evidence.find_seeds)
 def find_seeds(frame: Frame, theta: FloatArray, slope_std: float, seed: BoolArray) -> None:
     """Do what the twin does."""
-    candidates, knots, sigma_n = frame.candidates, frame.knots, math.exp(theta[1])
-    n_segments, n_bins, max_slope = len(candidates.offsets) - 1, 0, evidence.CLEARLY * slope_std
-    for c in range(len(seed)):
-        n_bins = max(n_bins, candidates.bin[c] + 1) if seed[c] else n_bins
-    if n_bins == 0:
+    if not seed.any():
         return
+    candidates, knots, sigma_n = frame.candidates, frame.knots, math.exp(theta[1])
+    n_segments, max_slope = len(candidates.offsets) - 1, evidence.CLEARLY * slope_std
+    n_bins = candidates.bin[seed].max() + 1
     table = np.full((n_segments, n_bins), np.inf)
     for m in range(n_segments):
         for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
             if seed[i]:
-                table[m, candidates.bin[i]] = candidates.z[i] - frame.prior_mean
+                table[m, candidates.bin[i]] = candidates.z[i]
     _rise_along(table, n_bins, max_slope, knots)
-    rise = np.empty(n_bins)
-    for j in range(n_bins):
-        rise[j] = max_slope * 2.0 * math.pi / n_segments * knots[j]
+    rise = max_slope * 2.0 * math.pi / n_segments * knots[:n_bins]
     # Twice around, either way, as the segments form a ring.
     for step in (1, -1):
         for k in range(1, 2 * n_segments):
@@ -40,9 +37,9 @@ def find_seeds(frame: Frame, theta: FloatArray, slope_std: float, seed: BoolArra
     _rise_along(table, n_bins, max_slope, knots)
     for m in range(n_segments):
         for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
-            if candidates.bin[i] < n_bins:
-                seed[i] &= not evidence.is_on_object(
-                    candidates.z[i] - frame.prior_mean, table[m, candidates.bin[i]], sigma_n
+            if seed[i]:
+                seed[i] = not evidence.is_on_object(
+                    candidates.z[i], table[m, candidates.bin[i]], sigma_n
                 )
 
 
@@ -69,9 +66,8 @@ def evidence_of_neighbours(
     n_segments, n_knots = mean.shape
     # Unsigned, as a signed index could count from the end.
     start, end = np.uintp(0), np.uintp(n_knots)
-    nearest, nearest_std, rise = np.empty(n_knots), np.empty(n_knots), np.empty(n_knots)
-    for j in range(start, end):
-        rise[j] = observation.slope_std * 2.0 * math.pi / n_segments * knots[j]
+    nearest, nearest_std = np.empty(n_knots), np.empty(n_knots)
+    rise = observation.slope_std * 2.0 * math.pi / n_segments * knots
     sill, own = math.exp(theta[0]) ** 2, np.empty((2, n_segments, n_knots))
     for m in range(n_segments):
         mean_m, std_m, height, deviation = mean[m], std[m], own[0, m], own[1, m]
@@ -96,11 +92,7 @@ def evidence_of_neighbours(
                 is_better = deviation[j] <= carried
                 nearest[j] = height[j] if is_better else nearest[j]
                 nearest_std[j] = deviation[j] if is_better else carried
-    for m in range(n_segments):
-        weighted, total = heights[m], precisions[m]
-        for j in range(start, end):
-            weighted[j] /= total[j] if total[j] > 0.0 else 1.0
-    return evidence.Evidence(heights, precisions)
+    return evidence.Evidence(heights / np.where(precisions > 0.0, precisions, 1.0), precisions)
 
 
 @compiled_form(evidence.join_evidence)

@@ -41,6 +41,7 @@ class _Columns(NamedTuple):
     above: BoolArray  # (n,) candidates that the evidence contradicts
     new: IntArray  # (n,) candidates that join in this round
     whitened: FloatArray  # (n, size) one row for each inlier
+    squares: FloatArray  # (2,) number and sum of the squared innovations, of all segments
 
 
 class _Prior(NamedTuple):
@@ -81,6 +82,7 @@ def _make_columns(frame: Frame, step: int, n_knots: int, precision: Any) -> _Col
         np.zeros(most, np.bool_),
         np.empty(most, np.int64),
         np.empty((most, width), precision),
+        np.zeros(2),
     )
 
 
@@ -92,14 +94,15 @@ def grow_inliers(
     from_neighbours: Evidence,
     step: int,
     found: SegmentSurfaces,
-) -> None:
+) -> float:
     """Do what the twin does; the inliers of other segments are arbitrary."""
     columns = _make_columns(frame, step, 0, np.float32)
     prior = _prior_of(frame, theta, model.observation)
     reach = math.exp(theta[3]) if model.by_roughness else 0.0
     for m in range(0, len(frame.candidates.offsets) - 1, step):
-        n_new = _begin(frame, m, prior.noise, reach, from_neighbours, found, columns)
-        _grow(frame, m, n_new, prior, model, found, columns)
+        n_seeds = _begin(frame, m, prior.noise, reach, from_neighbours, found, columns)
+        _grow(frame, m, n_seeds, prior, model, found, columns)
+    return columns.squares[1] / columns.squares[0] if columns.squares[0] > 0.0 else 1.0
 
 
 @compiled_form(ground.regress)
@@ -118,8 +121,7 @@ def regress(
     r, length_scale = columns.r, columns.length_scale
     for m in range(0, len(found.mean), step):
         mean, std, knot_u = found.mean[m], found.std[m], found.knot_log_length_scale[m]
-        for j in range(len(knots)):
-            mean[j] = std[j] = np.nan
+        mean[:] = std[:] = np.nan
         n = n_knots = 0
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
             if found.inlier[c]:
@@ -147,8 +149,7 @@ def _lay_out(n: int, prior: _Prior, columns: _Columns) -> int:
     Their log length-scales become length-scales.
     """
     size, r, length_scale = (n + LANES - 1) & -LANES, columns.r, columns.length_scale
-    for j in range(n, size):
-        r[j] = length_scale[j] = 0.0
+    r[n:size] = length_scale[n:size] = 0.0
     for j in range(size):
         length_scale[j] = math.exp(length_scale[j])
         columns.height[j] = 0.0
@@ -237,8 +238,9 @@ def _grow(
         )
         if n_new == 0:
             break
-    for c in range(first, first + n):
-        found.doubt[c] = columns.noise[c - first] - ground.noise_among(found.alike[c], prior.noise)
+    found.doubt[first : first + n] = columns.noise[:n] - ground.noise_among(
+        found.alike[first : first + n], prior.noise
+    )
 
 
 @jit(part=True)
@@ -326,6 +328,8 @@ def _observe(
     precision = 1.0 / (max(columns.variance[i], 0.0) + columns.noise[i])
     scale = number(math.sqrt(precision))
     innovation = number(columns.z[i] - columns.height[i]) * scale
+    columns.squares[0] += 1.0
+    columns.squares[1] += innovation * innovation
     for j in range(start, end):
         value = columns.whitened[n, j] * scale
         columns.whitened[n, j] = value

@@ -114,43 +114,22 @@ def find_seeds(frame: Frame, theta: FloatArray, slope_std: float, seed: BoolArra
     """Remove candidates that stand on others from `seed` (C,).
 
     Seeds are low and near (``growth.seed_height_tolerance``, ``growth.seed_range``). What stands
-    higher over one of these than noise and prior slope explain stands on something.
+    higher over one of these than noise and prior slope explain stands on something. Distances are
+    taken along ranges and arcs, between the near edges of bins: outwards and inwards, around, and
+    outwards and inwards again.
     """
-    z = frame.candidates.z - frame.prior_mean
-    highest = highest_ground(frame, z, seed, CLEARLY * slope_std)
-    seed &= ~is_on_object(z, highest, np.exp(theta[1]))
-
-
-def highest_ground(frame: Frame, z: FloatArray, seed: BoolArray, max_slope: float) -> FloatArray:
-    """Largest height of ground that rises by `max_slope` from the seeds, (C,) [m].
-
-    Distances are taken along ranges and arcs, between the near edges of bins: outwards and
-    inwards, around, and outwards and inwards again.
-
-    Parameters
-    ----------
-    frame : Frame
-        Candidates and knots.
-    z : (C,) float64
-        Heights of the candidates [m].
-    seed : (C,) bool
-        Candidates that the ground rises from.
-    max_slope : float
-        Rise per metre.
-    """
-    candidates, segment = frame.candidates, frame.candidates.segment
     if not seed.any():
-        return np.full(len(z), np.inf)
-    n_segments, n_bins = len(candidates.offsets) - 1, int(candidates.bin[seed].max()) + 1
-    table = np.full((n_segments, n_bins), np.inf)
-    table[segment[seed], candidates.bin[seed]] = z[seed]
-    along = max_slope * frame.knots[:n_bins, None]
+        return
+    candidates, n_segments = frame.candidates, frame.candidates.n_segments
+    place, z = (candidates.segment[seed], candidates.bin[seed]), candidates.z[seed]
+    table = np.full((n_segments, int(place[1].max()) + 1), np.inf)
+    table[place] = z
+    along = CLEARLY * slope_std * frame.knots[: table.shape[1], None]
     around = np.arange(3.0 * n_segments)[:, None] * (2.0 * math.pi / n_segments * along.T)
     table = _rising(table.T, along).T
     table = _rising(np.concatenate([table] * 3), around)[n_segments : 2 * n_segments]
     table = _rising(table.T, along).T
-    near = np.minimum(candidates.bin, n_bins - 1)
-    return np.where(candidates.bin < n_bins, table[segment, near], np.inf)
+    seed[seed] = ~is_on_object(z, table[place], np.exp(theta[1]))
 
 
 def _rising(table: FloatArray, place: FloatArray) -> FloatArray:

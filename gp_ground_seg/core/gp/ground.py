@@ -40,7 +40,7 @@ from gp_ground_seg.core.gp.latent import (
     given_theta,
     latent_log_length_scales,
 )
-from gp_ground_seg.core.gp.model import Model, SegmentSurfaces
+from gp_ground_seg.core.gp.model import Model, SegmentSurfaces, scaled
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, GrowthConfig, ObservationConfig
 from gp_ground_seg.core.pipeline.lines import is_walkable
@@ -89,22 +89,32 @@ def fit_surfaces(
 ) -> None:
     """Set the inliers and surfaces of all segments; `given` (T,) is `given_theta`.
 
-    Where neighbours are used, one of `STEP` segments grows by itself first. Then all grow: the
-    prediction is that of the segment and of those beside it together, and what stands above the
-    latter alone does not start the set (see `gp_ground_seg.core.gp.evidence`). The surface, too,
-    is that of the segment and of those beside it together.
+    Where neighbours are used, one of `STEP` segments grows by itself first. Its innovations tell
+    how smooth the ground of the frame is, which narrows the prior. Then all grow: the prediction
+    is that of the segment and of those beside it together, and what stands above the latter alone
+    does not start the set (see `gp_ground_seg.core.gp.evidence`). The surface, too, is that of the
+    segment and of those beside it together.
     """
     knots, observation, mean, std = frame.knots, model.observation, found.mean, found.std
     u, knot_u = found.log_length_scale, found.knot_log_length_scale
     if model.is_latent:
         latent_log_length_scales(frame, given, 1, u, knot_u)
-    from_neighbours = Evidence(np.empty((0, 0)), np.empty((0, 0)))
+    from_neighbours, scale = Evidence(np.empty((0, 0)), np.empty((0, 0))), 1.0
     if model.uses_neighbours:
         find_seeds(frame, given, observation.slope_std, found.seed)
-        grow_inliers(frame, given, model, from_neighbours, STEP, found)
+        mean_square = grow_inliers(frame, given, model, from_neighbours, STEP, found)
         regress(frame, given, observation, STEP, found)
-        from_neighbours = evidence_of_neighbours(mean, std, knots, given, observation)
+        scale = max(min(ROUGHEST * math.sqrt(mean_square), 1.0), LEAST_SCALE)
+        given, model = scaled(given, model, scale)
+        from_neighbours = evidence_of_neighbours(
+            mean, scale * std, knots, given, model.observation
+        )
+        found.seed[:] &= (
+            np.abs(frame.candidates.z - frame.prior_mean)
+            <= scale * model.growth.seed_height_tolerance
+        )
     grow_inliers(frame, given, model, from_neighbours, 1, found)
+    found.doubt[:] /= scale * scale  # theta, as learned, is that of the whole prior
     if model.is_latent and (theta[2:] != given[2:]).any():
         latent_log_length_scales(frame, theta, 1, u, knot_u)
     regress(frame, theta, observation, 1, found)
@@ -129,6 +139,10 @@ FARTHEST = 1e15
 """Height over which all are equally far from a surface [m]: single precision holds its square."""
 RISES_ON = 0.8
 """Part of the slope to a candidate with which the ground behind it must rise on."""
+LEAST_SCALE, ROUGHEST = 0.2, 3.0
+"""Least scale of the prior, and the largest in parts of the ground found first, which is smoother
+than what has not joined yet; if all deviations are scaled alike, the likelihood of the former is
+greatest at the root of the mean square of its innovations."""
 
 
 @shared
@@ -232,7 +246,7 @@ def grow_inliers(
     from_neighbours: Evidence,
     step: int,
     found: SegmentSurfaces,
-) -> None:
+) -> float:
     """Let the inliers of every `step`-th segment grow from seeds, in `found`, under `theta`.
 
     A candidate joins when its height `fits` the prediction, or when the ground carries on to it
@@ -241,7 +255,8 @@ def grow_inliers(
 
     `from_neighbours` is the evidence of the segments beside each. If ``label.rule`` is roughness,
     a candidate among others, or that joins in doubt, shows less: see `noise_among` and
-    `noise_in_doubt`. Where the ground carries on to it there is no doubt.
+    `noise_in_doubt`. Where the ground carries on to it there is no doubt. Returns the mean square
+    of the innovations of the inliers, in standard deviations; 1 without any.
     """
     sill, gate_noise = variances_of(frame, theta, model.observation, ROUNDING_SINGLE)
     grows = frame.candidates.segment % step == 0
@@ -275,6 +290,7 @@ def grow_inliers(
                 break
     found.inlier[:] = False
     found.inlier[grows], found.alike[grows], found.doubt[grows] = chosen, alike, noise - certain
+    return -float(tables[:, 0, 0].sum()) / chosen.sum() if chosen.any() else 1.0
 
 
 def _on_slope(
@@ -317,7 +333,8 @@ def _prior_tables(
     """Prior of every segment by log length-scales `u` (C,).
 
     The table of a segment has a row and a column with the residuals of its candidates, and then
-    the covariance of their heights. In single precision, (M, 1 + n, 1 + n) for at most n.
+    the covariance of their heights; conditioned, it begins with the negative sum of the squared
+    innovations. In single precision, (M, 1 + n, 1 + n) for at most n.
     """
     candidates = frame.candidates
     z = np.clip(candidates.z - frame.prior_mean, -FARTHEST, FARTHEST)

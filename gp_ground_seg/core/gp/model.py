@@ -8,6 +8,7 @@ import numpy as np
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame
 from gp_ground_seg.core.gp.latent import given_log_length_scales
+from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import (
     Config,
     GrowthConfig,
@@ -15,6 +16,8 @@ from gp_ground_seg.core.parameters.config import (
     ObservationConfig,
 )
 from gp_ground_seg.core.parameters.schema import numbers_of
+
+_Observation = ObservationConfig.Numbers
 
 
 class Model(NamedTuple):
@@ -42,6 +45,14 @@ class Model(NamedTuple):
             config.label.rule == 'roughness',
             config.surface.look_aside and has_slope,
         )
+
+
+@shared
+def scaled(theta: FloatArray, model: Model, scale: float) -> tuple[FloatArray, Model]:
+    """Theta and model with all standard deviations of the observation process scaled."""
+    o = model.observation
+    narrow = _Observation(o.sigma_f, o.sigma_n, scale * o.slope_std, scale * o.slope_drift)
+    return np.append(theta[:2] + np.log(scale), theta[2:]), Model(narrow, *model[1:])
 
 
 class SegmentSurfaces(NamedTuple):
