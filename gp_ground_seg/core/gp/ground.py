@@ -114,7 +114,7 @@ def fit_surfaces(
             <= scale * model.growth.seed_height_tolerance
         )
     grow_inliers(frame, given, model, from_neighbours, 1, found)
-    found.doubt[:] /= scale * scale  # theta, as learned, is that of the whole prior
+    found.doubt[:] /= scale * scale  # as if the prior had not been scaled: `theta` is not
     if model.is_latent and (theta[2:] != given[2:]).any():
         latent_log_length_scales(frame, theta, 1, u, knot_u)
     regress(frame, theta, observation, 1, found)
@@ -140,9 +140,9 @@ FARTHEST = 1e15
 RISES_ON = 0.8
 """Part of the slope to a candidate with which the ground behind it must rise on."""
 LEAST_SCALE, ROUGHEST = 0.2, 3.0
-"""Least scale of the prior, and the largest in parts of the ground found first, which is smoother
-than what has not joined yet; if all deviations are scaled alike, the likelihood of the former is
-greatest at the root of the mean square of its innovations."""
+"""Least scale of the prior, and its scale over the root mean square of the innovations, at which
+the likelihood is greatest: ground that has not joined yet may be so many times as rough as that
+which has."""
 
 
 @shared
