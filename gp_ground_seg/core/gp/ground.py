@@ -357,14 +357,14 @@ def _observe(
     offsets, segment, which = candidates.offsets, candidates.segment, np.flatnonzero(new)
     bounds, size = np.searchsorted(which, offsets), 1 + np.diff(offsets)
     column = np.arange(1, len(new) + 1) - offsets[segment]
-    # One by one: a batch of small matrices is mostly padding.
+    # One by one: a batch of small matrices is mostly padding. Whole rows lie side by side.
     for m in np.flatnonzero(np.diff(bounds)):
-        table, own = tables[m, : size[m], : size[m]], which[bounds[m] : bounds[m + 1]]
+        table, own = tables[m, : size[m]], which[bounds[m] : bounds[m + 1]]
         rows = table.take(column[own], axis=0)
         within = rows.take(column[own], axis=1)
         within.ravel()[:: len(within) + 1] += noise[own]
         rows = whitened(within, rows)
-        table -= rows.T @ rows
+        table -= rows[:, : size[m]].T @ rows
     return tables[segment, 0, column], tables[segment, column, column].astype(np.float64)
 
 

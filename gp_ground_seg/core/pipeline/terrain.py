@@ -172,12 +172,14 @@ def _in_front(candidates: Candidates, near: IntArray) -> BoolArray:
 
 
 def _groups(n: int, first: IntArray, second: IntArray) -> IntArray:
-    """Group of each of `n` members, (n,), of which those of a pair are in one group."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_array((np.ones(len(first), dtype=np.bool_), (first, second)), shape=(n, n))
-    group: IntArray = connected_components(graph, directed=False)[1]
+    """First member of the group of each of `n`, (n,); those of a pair are in one group."""
+    group = np.arange(n)
+    while (is_apart := group[first] != group[second]).any():
+        first, second = first[is_apart], second[is_apart]
+        a, b = group[first], group[second]
+        np.minimum.at(group, np.maximum(a, b), np.minimum(a, b))
+        while (group != (further := group[group])).any():
+            group = further
     return group
 
 
