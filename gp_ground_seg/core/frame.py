@@ -111,11 +111,6 @@ class Tiles(NamedTuple):
         place = as_index(self.place)
         return np.asarray(padded.ravel()[(place + 2 * (place // self.n_sides))[:, None] + steps])
 
-    @property
-    def lowest_z(self) -> PointArray:
-        """Height of the lowest point of each tile, (T,) [m]."""
-        return np.asarray(self.extremes[:, 0])
-
 
 class Candidates(NamedTuple):
     """Ground candidates PG_m of all segments, near to far in each."""

@@ -293,16 +293,15 @@ class Diagnostics:
 
     def _publish(self) -> None:
         limits, now = self._config.diagnostics, self._node.get_clock().now()
-        steady = time.monotonic()
         statuses = [
-            self.input.report(steady, 1e-9 * now.nanoseconds, limits),
+            self.input.report(time.monotonic(), 1e-9 * now.nanoseconds, limits),
             self.processing.report(limits),
             model_status(self._newest, self._config.frame.level),
         ]
         array, node_name = DiagnosticArray(), self._node.get_fully_qualified_name()
         array.header.stamp = now.to_msg()
-        if steady >= self._log_due:  # the throttle of rclpy takes 1 ms
-            self._log_due = steady + LOG_PERIOD
+        if time.monotonic() >= self._log_due:  # the throttle of rclpy takes 1 ms
+            self._log_due += LOG_PERIOD
             said = '; '.join(f'{own.task} {own.level.name}: {own.message}' for own in statuses)
             self._node.get_logger().info(f'so far: {self.summary()}; {said}')
         array.status = [

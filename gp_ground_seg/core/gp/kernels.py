@@ -106,8 +106,6 @@ class Padded(NamedTuple):
 
     def take(self, values: npt.NDArray[np.generic], fill: float = 0.0) -> FloatArray:
         """Values of the segments, (S, n), with `fill` for padding."""
-        if self.place.size == 0:
-            return np.full(self.place.shape, fill)
         return np.where(self.mask, values[self.place], fill)
 
 

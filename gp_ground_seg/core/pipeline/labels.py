@@ -75,7 +75,7 @@ def label_points(
         sums = near_sums(over[near], tile[near], faces.is_face, units)
         roughness = ground_roughness(tiles, sums, units)
     band = ground_band(roughness, highest, label).astype(dtype)
-    lowest = np.append(tiles.lowest_z.astype(np.float64), 0.0)
+    lowest = np.append(tiles.extremes[:, 0].astype(np.float64), 0.0)
     top = top_of_face(roughness, lowest, faces.has_occluded_base, label)
     is_in_flat = is_flat(scan.extent, label.ground_tolerance)[as_index(grid.cell)]
     is_limited = faces.is_face[tile] & (faces.has_occluded_base[tile] | ~is_in_flat)

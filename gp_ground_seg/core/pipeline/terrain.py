@@ -174,9 +174,7 @@ def _in_front(candidates: Candidates, near: IntArray) -> BoolArray:
 def _groups(n: int, first: IntArray, second: IntArray) -> IntArray:
     """First member of the group of each of `n`, (n,); those of a pair are in one group."""
     group = np.arange(n)
-    while (is_apart := group[first] != group[second]).any():
-        first, second = first[is_apart], second[is_apart]
-        a, b = group[first], group[second]
+    while ((a := group[first]) != (b := group[second])).any():
         np.minimum.at(group, np.maximum(a, b), np.minimum(a, b))
         while (group != (further := group[group])).any():
             group = further

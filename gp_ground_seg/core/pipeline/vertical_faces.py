@@ -124,7 +124,7 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
 def _with_flat_foot(scan: Scan, tolerance: float) -> CellArray:
     """Tiles of whose lowest returns some are in a flat cell, with repetitions."""
     candidates = scan.candidates
-    is_foot = candidates.z - scan.tiles.lowest_z[candidates.tile] <= tolerance
+    is_foot = candidates.z - scan.tiles.extremes[candidates.tile, 0] <= tolerance
     cell = candidates.segment * scan.grid.n_bins + candidates.bin
     result: CellArray = candidates.tile[is_foot & is_flat(scan.extent[cell], tolerance)]
     return result
