@@ -29,6 +29,7 @@ SLOW = {
     'publish': 'publishing, as when a subscriber is slow',
 }
 """Stages of a cloud, as they are named when they take long."""
+COMPILING = ' while compiling'  # behind the name of the backend that is used until then
 Level = IntEnum('Level', 'OK WARN ERROR STALE', start=0)
 """Severity, with the values of ``diagnostic_msgs/DiagnosticStatus``."""
 
@@ -176,14 +177,17 @@ class ProcessingTask:
                 'what sends it is late, or has another clock'
             )
         if n_dropped:
-            faults.append(f'clouds dropped since the last report: {n_dropped}')
+            faults.append(
+                f'clouds dropped since the last report: {n_dropped}'
+                + f', by {SLOW["total"].format(self._backend)}' * self._backend.endswith(COMPILING)
+            )
         self._n_reported = self.n_dropped
         good = 'no cloud processed yet' if latency is None else f'median latency {latency:.1f} ms'
         values = {
             'Clouds since startup': str(self.n_processed),
             'Dropped since startup': str(self.n_dropped),
             'Median latency (ms)': _digits(latency, '.2f'),
-            'Backend': self._backend,
+            'Backend': self._backend.removesuffix(COMPILING),
             'Age of transform (s)': _digits(self._age, '.3f'),
         }
         return judged('processing', faults, good, values)
@@ -272,10 +276,15 @@ class Diagnostics:
             self._timer.reset()
 
     def published(
-        self, scan: Segmentation, arrival: float, stages: Mapping[str, float], age: float | None
+        self,
+        scan: Segmentation,
+        arrival: float,
+        stages: Mapping[str, float],
+        age: float | None,
+        is_compiling: bool,
     ) -> None:
         """Count the cloud that came at `arrival` [s], as in `processed`; log its stages."""
-        logger, backend = self._node.get_logger(), scan.backend
+        logger, backend = self._node.get_logger(), scan.backend + COMPILING * is_compiling
         times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
         logger.debug(f'times of the stages [ms]: {times}')
         if self._newest is None:
