@@ -26,7 +26,6 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import numbers_of
 from gp_ground_seg.core.pipeline.ground_plane import find_planes
 from gp_ground_seg.core.pipeline.labels import (
-    depth_of_ground,
     highest_ground,
     lowest_of,
     number_shift,
@@ -105,7 +104,6 @@ class NumbaBackend:
             relief.is_level,
             surface.knots[0],
             numbers_of(config.label),
-            depth_of_ground(height, config.label),
             highest_ground(height),
             sum_units(n_points),
             number_shift(n_points),

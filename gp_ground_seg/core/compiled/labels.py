@@ -44,7 +44,6 @@ def label_points(
     is_level: bool,
     nearest: float,
     config: LabelConfig,
-    depth: float,
     highest: float,
     units: float,
     shift: int,
@@ -55,9 +54,9 @@ def label_points(
     """Height, label and margin of each point, into `result`.
 
     Here `Scan.xyz` is (3, N). `pieces` are those of `linear_pieces`, from the range `nearest` on,
-    `relief` those of the relief, and `is_level` says whether it is level; `depth`, `highest`,
-    `units`, `shift` and `lowest` are those of `depth_of_ground`, `highest_ground`, `sum_units`,
-    `number_shift` and `lowest_of`; `by_roughness` is the rule of the parameters.
+    `relief` those of the relief, and `is_level` says whether it is level; `highest`, `units`,
+    `shift` and `lowest` are those of `highest_ground`, `sum_units`, `number_shift` and
+    `lowest_of`; `by_roughness` is the rule of the parameters.
     """
     n_tiles, number = len(scan.tiles.place), result.height.dtype.type
     tables, roughness = (pieces, relief, is_level, number(nearest)), np.zeros(n_tiles + 1)
@@ -75,6 +74,7 @@ def label_points(
             limits[t, 2] = limits[t, 1] if is_occluded else math.inf
     for c in range(len(kind)):
         kind[c] = 2 if is_flat(scan.extent[c], config.ground_tolerance) else 1
+    depth = config.obstacle_max_height if by_roughness else config.ground_tolerance
     _set_margins(scan, limits.reshape(-1), kind, number(depth), result)
     if by_roughness:
         _vote(scan, near_tile, lowest, config, result.margin)

@@ -55,10 +55,11 @@ def label_points(
     """Label points by their height over the surface (paper, Algorithm 2, line 14).
 
     A point within the paper's tolerance is ground; above it, the roughness of the ground about it
-    decides (see `ground_band`); below the surface there is no obstacle, down to `depth_of_ground`
-    for a sensor at a `height` [m]. Of a tile with a vertical face only returns in a flat cell, and
-    near its lowest one, are ground; none are where the base is occluded. Then the returns near the
-    surface vote (see `mean_votes`).
+    decides (see `ground_band`, and `highest_ground` for a sensor at a `height` [m]); below the
+    surface there is no obstacle, down to ``label.obstacle_max_height``, or by the rule tolerance
+    down to that. Of a tile with a vertical face only returns in a flat cell, and near its lowest
+    one, are ground; none are where the base is occluded. Then the returns near the surface vote
+    (see `mean_votes`).
     """
     grid, tiles, label = scan.grid, scan.tiles, config.label
     by_roughness, dtype = label.rule == 'roughness', scan.xyz.dtype
@@ -80,7 +81,7 @@ def label_points(
     is_in_flat = is_flat(scan.extent, label.ground_tolerance)[as_index(grid.cell)]
     is_limited = faces.is_face[tile] & (faces.has_occluded_base[tile] | ~is_in_flat)
     top = np.where(is_limited, top.astype(dtype)[tile], np.inf).astype(dtype)
-    depth = depth_of_ground(height, label)
+    depth = label.obstacle_max_height if by_roughness else label.ground_tolerance
     with np.errstate(invalid='ignore'):  # points outside may be infinitely high
         margin: PointArray = margin_of(over, z, band[tile], top, depth)
     if by_roughness:
@@ -90,15 +91,6 @@ def label_points(
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
     return Labelled(result, over, margin)
-
-
-def depth_of_ground(height: float, label: LabelConfig) -> float:
-    """Depth below the surface down to which a return is ground [m].
-
-    A sensor at a `height` below 1 m sees tops of what stands on lower terrain behind an edge.
-    """
-    by_roughness = min(height, 1.0) * label.obstacle_max_height
-    return by_roughness if label.rule == 'roughness' else label.ground_tolerance
 
 
 def highest_ground(height: float) -> float:
