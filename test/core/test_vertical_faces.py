@@ -75,6 +75,14 @@ def test_a_face_below_an_edge_shows_no_ground(backend):
         assert is_face[-60:].all() and (is_occluded[-60:] == is_beyond).all()
 
 
+@pytest.mark.parametrize(('first', 'height', 'top'), [(-29, 0.5, 1), (-5, 0.5, 0), (-29, 0, 0)])
+def test_what_rays_pass_on_both_sides_below_an_edge_is_a_top(backend, first, height, top):
+    azimuth = np.radians(np.arange(first, 30, 2))  # in the middle of each segment
+    r = np.where(np.abs(azimuth) < 0.1, 10.0, 25.0)
+    xyz = r * [np.cos(azimuth), np.sin(azimuth), np.full_like(azimuth, -0.1)]
+    assert (faces_of(backend, xyz.T, height)[0] == (top & (r < 20.0))).all()
+
+
 @settings(max_examples=fewer(30, 10))
 @given(st.integers(0, 10_000), st.sampled_from([np.float32, np.float64]))
 def test_backends_find_the_same_faces(compiled_code, seed, dtype):

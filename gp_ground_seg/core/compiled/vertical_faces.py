@@ -14,6 +14,7 @@ from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import FacesConfig, LabelConfig
 from gp_ground_seg.core.pipeline import vertical_faces as plain
 from gp_ground_seg.core.pipeline.roughness import UNKNOWN_LEVEL
+from gp_ground_seg.core.pipeline.terrain import mark_beyond_edges
 
 
 @jit(entry=True)
@@ -44,13 +45,7 @@ def find_faces(
             )
             faces.has_occluded_base[t] = is_occluded
     _mark_scattered(tiles, tall, whole, height, label, faces)
-    for m in range(len(candidates.offsets) - 1):
-        before = 0.0
-        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
-            r, tile = candidates.r[c], candidates.tile[c]
-            if plain.is_beyond_edge(r - before, r, candidates.z[c] + height, label):
-                faces.has_occluded_base[tile] = faces.is_face[tile]
-            before = r
+    mark_beyond_edges(candidates, height, plain.face_height(label), faces)
 
 
 @jit()

@@ -305,3 +305,40 @@ def with_standing(faces: Faces, tile: CellArray, stands: BoolArray) -> Faces:
     shows_none[tile[stands]] = True
     shows_none[tile[~stands]] = False
     return Faces(faces.is_face | shows_none, faces.has_occluded_base | shows_none, faces.is_steep)
+
+
+@shared
+def mark_beyond_edges(candidates: Candidates, height: float, least: float, faces: Faces) -> None:
+    """Mark the tiles of what stands on lower terrain, behind the edge of the own level.
+
+    The own level, `height` [m] below the origin, ends where no ground is seen before a candidate
+    that is lower by `least` [m]. From there on a face has an occluded base, and what rays pass on
+    both sides is on top of something, which is a face.
+    """
+    r, offsets, segment, beyond = candidates.r, candidates.offsets, 0, -1
+    for c in np.flatnonzero(candidates.z < -height - least):
+        while offsets[segment + 1] <= c:
+            segment += 1
+        is_first, tile = c == offsets[segment], candidates.tile[c]
+        if beyond == segment or r[c] - (0.0 if is_first else r[c - 1]) > longest_gap(r[c]):
+            is_top = is_passed(candidates, segment, c, -1) and is_passed(candidates, segment, c, 1)
+            # An origin on the ground is not where the rays start.
+            faces.is_face[tile] |= is_top and height > least
+            faces.has_occluded_base[tile] = faces.is_face[tile]
+            beyond = beyond if is_first else segment
+
+
+@shared
+def is_passed(candidates: Candidates, segment: int, c: np.intp, side: int) -> bool:
+    """Whether a ray on one side, -1 or 1, passes candidate `c`, no higher, and goes on beyond it.
+
+    That is one in another segment, within `MIN_WIDTH`.
+    """
+    r, z, offsets = candidates.r, candidates.z, candidates.offsets
+    n_segments, beyond = len(offsets) - 1, r[c] + longest_gap(r[c])
+    for aside in range(1, int(MIN_WIDTH / arc_of(r[c], n_segments)) + 1):
+        beside = (segment + side * aside) % n_segments
+        far = offsets[beside] + np.searchsorted(r[offsets[beside] : offsets[beside + 1]], beyond)
+        if far < offsets[beside + 1] and z[far] * r[c] <= (z[c] + STEP_TOLERANCE) * r[far]:
+            return True
+    return False

@@ -36,7 +36,7 @@ from gp_ground_seg.core.pipeline.roughness import (
     level_at,
     levels_about,
 )
-from gp_ground_seg.core.pipeline.terrain import MAX_SLOPE, longest_gap
+from gp_ground_seg.core.pipeline.terrain import MAX_SLOPE, mark_beyond_edges
 
 MIN_RETURNS = 4
 """Returns that a tile needs to have an orientation."""
@@ -113,11 +113,7 @@ def find_faces(scan: Scan, height: float, config: Config) -> Faces:
     is_face, place = result.is_face[tall], tiles.place[tall]
     rough = tall[_scattered(place, n_sides, whole, is_face, extent, over, label)]
     result.is_face[rough] = result.has_occluded_base[rough] = True
-    candidates = scan.candidates
-    is_next = np.diff(candidates.segment, prepend=-1) == 0
-    gap = candidates.r - np.where(is_next, np.roll(candidates.r, 1), 0.0)
-    beyond = candidates.tile[is_beyond_edge(gap, candidates.r, candidates.z + height, label)]
-    result.has_occluded_base[beyond] = result.is_face[beyond]
+    mark_beyond_edges(scan.candidates, height, face_height(label), result)
     return result
 
 
@@ -185,15 +181,6 @@ def is_examined(extent: Values, over: Values, place: Values, label: LabelConfig)
     face = face_height(label)
     is_sample = (place % SAMPLED == 0) & (over > -0.5 * face)
     return ((extent > face) | (over > 0.5 * face) | is_sample) & (np.abs(over) < FARTHEST)
-
-
-@shared
-def is_beyond_edge(gap: Values, r: Values, over: Values, label: LabelConfig) -> Values:
-    """Whether no ground is seen before a candidate, which is `over` the own level [m], and lower.
-
-    A face there is of what stands on lower terrain behind an edge, which hides its base.
-    """
-    return (gap > longest_gap(r)) & (over < -face_height(label))
 
 
 @shared
