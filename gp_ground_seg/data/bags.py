@@ -67,8 +67,7 @@ def storage_of(path: Path) -> str:
 
 def check_sqlite_path(path: Path) -> None:
     """Raise DataError for a path that rosbags, which gives it to sqlite as a URI, misreads."""
-    awkward = sorted(set('?#%') & set(str(path.absolute())))
-    if awkward:
+    if awkward := sorted(set('?#%') & set(str(path.absolute()))):
         raise DataError(f'{path}: a sqlite3 bag cannot have {" ".join(awkward)} in its path')
 
 

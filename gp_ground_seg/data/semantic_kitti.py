@@ -95,8 +95,7 @@ def list_sequences(root: str | Path) -> list[str]:
 def list_frames(root: str | Path, sequence: str, columns: int = KITTI_COLUMNS) -> list[Frame]:
     """Frames of one sequence, in order; DataError if there are none, or times.txt does not fit."""
     folder = Path(root, 'sequences', sequence)
-    paths = sorted(folder.glob('velodyne/*.bin'))
-    if not paths:
+    if not (paths := sorted(folder.glob('velodyne/*.bin'))):
         known = ', '.join(list_sequences(root))
         raise DataError(f'{folder}: no velodyne/*.bin in it; sequences here: {known}')
     labels = {path.stem: path for path in (folder / 'labels').glob('*.label')}

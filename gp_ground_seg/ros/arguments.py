@@ -96,8 +96,7 @@ def _check_surroundings(words: Sequence[str]) -> None:
 
 def check_middleware() -> None:
     """Raise a ConfigError where rcl would end this process when it is imported."""
-    name = os.environ.get('RMW_IMPLEMENTATION')
-    if not name:
+    if not (name := os.environ.get('RMW_IMPLEMENTATION')):
         return
     command = [sys.executable, '-c', 'import rclpy._rclpy_pybind11']
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -310,7 +310,7 @@ class Diagnostics:
         array, node_name = DiagnosticArray(), self._node.get_fully_qualified_name()
         array.header.stamp = now.to_msg()
         if time.monotonic() >= self._log_due:  # the throttle of rclpy takes 1 ms
-            self._log_due += LOG_PERIOD
+            self._log_due = time.monotonic() + LOG_PERIOD
             said = '; '.join(f'{own.task} {own.level.name}: {own.message}' for own in statuses)
             self._node.get_logger().info(f'so far: {self.summary()}; {said}')
         array.status = [

@@ -199,8 +199,7 @@ class CloudSubscription:
             for entry in entries
             if entry.topic_type == CLOUD_TYPE
         }
-        is_changed = self._offered.keys() != before
-        if is_changed:
+        if is_changed := self._offered.keys() != before:
             self._numbers.clear()
         return is_changed
 

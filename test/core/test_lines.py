@@ -63,10 +63,6 @@ def draw_candidates(seed, n_segments=8, most=30):
 BOUNDS = 'growth.max_slope', 'growth.min_rise_extent', 'lines.max_density_ratio'
 
 
-def draw_faces(seed):
-    return Faces(*(np.random.default_rng(seed).uniform(size=(3, N_TILES)) < 0.2))
-
-
 @settings(max_examples=fewer(40, 20))
 @given(
     st.integers(0, 10_000),
@@ -78,7 +74,8 @@ def draw_faces(seed):
 def test_lines_and_pseudo_inputs_are_the_reference(
     compiled_code, seed, per, error_ratio, shared, bounds
 ):
-    candidates, faces = draw_candidates(seed), draw_faces(seed)
+    candidates = draw_candidates(seed)
+    faces = Faces(*(np.random.default_rng(seed).uniform(size=(3, N_TILES)) < 0.2))
     config = Config().replace(
         **{
             'lines.max_gap': 6.0,

@@ -13,10 +13,6 @@ from gp_ground_seg.data.inputs import holds_bag
 NAMES = 'drive', 'drive.mcap', 'drive.db3'
 
 
-def new_bag_at(path):
-    bags.new_bag(path, {}).__enter__()
-
-
 @pytest.mark.parametrize('name', NAMES)
 def test_messages_come_back_bit_for_bit(tmp_path, name):
     path = tmp_path / name
@@ -107,7 +103,9 @@ def test_what_is_no_bag_is_never_replaced(tmp_path, name):
     assert (tmp_path / 'file').read_text() == 'years of work'
 
 
-@pytest.mark.parametrize('call', [bags.BagReader, new_bag_at, bags.decode_cloud])
+@pytest.mark.parametrize(
+    'call', [bags.BagReader, lambda path: bags.new_bag(path, {}).__enter__(), bags.decode_cloud]
+)
 def test_without_rosbags_the_error_says_what_to_install(monkeypatch, call):
     bags.jazzy_types.cache_clear()
     monkeypatch.setitem(sys.modules, 'rosbags', None)

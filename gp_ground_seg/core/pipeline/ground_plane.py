@@ -342,12 +342,6 @@ def crossing_of(r: Values, height: Values, plane: Plane) -> Values:
 
 
 @shared
-def refutation_by(crossing: Values) -> Values:
-    """Refutation of a plane by a ray that crosses it at a range; a whole number."""
-    return np.floor(REFUTATION * RESOLUTION * nearness(crossing))
-
-
-@shared
 def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     """Weight of the rays that cross a plane where it should have stopped them; a whole number.
 
@@ -365,7 +359,7 @@ def refutation_of(plane: Plane, cells: LowestPoints) -> float:
     crossing, sector = crossing_of(r[below], height[below], plane), sector[below]
     ring = np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
     counts = (crossing < reach[sector]) & ~is_seen[sector * N_RINGS + ring]
-    return float(refutation_by(crossing[counts]).sum())
+    return float(np.floor(REFUTATION * RESOLUTION * nearness(crossing[counts])).sum())
 
 
 def refine(
