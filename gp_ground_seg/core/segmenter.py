@@ -10,7 +10,7 @@ import os
 import textwrap
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import chain, islice, tee
+from itertools import islice
 from numbers import Real
 from pathlib import Path
 from time import perf_counter
@@ -272,7 +272,7 @@ class GroundSegmenter:
     def _find_ground(self, level: PointArray, scan: Scan) -> tuple[View | None, View | None]:
         """View of the ground, and where it clearly lies if that is too far from z."""
         below = self._past_images(scan, self._look(scan))
-        view = self._past_facades(level, scan, below) if is_doubtful(below) else below
+        view = self._about_axes(level, below) if is_doubtful(below) else below
         if view is None or view.can_level:
             return view, None
         # The scan will not be levelled: the ground that matters is about level.
@@ -300,7 +300,7 @@ class GroundSegmenter:
                     return again
         return below
 
-    def _past_facades(self, xyz: PointArray, scan: Scan, below: View | None) -> View | None:
+    def _about_axes(self, xyz: PointArray, below: View | None) -> View | None:
         """View of the ground about z or another axis; that `below` z is doubtful."""
         sample = xyz[:: len(xyz) // ENOUGH_POINTS + 1]
 
@@ -311,15 +311,17 @@ class GroundSegmenter:
 
         if below is not None and below.is_steep:
             below = look(UPRIGHT) or below
-        others = chain(self._views(scan), map(look, OTHER_AXES))
-        return clearest(below, others) if is_doubtful(below) else below
+        return clearest(below, map(look, OTHER_AXES)) if is_doubtful(below) else below
 
     def _look(
         self, scan: Scan, turn: FloatArray = UPRIGHT, max_tilt: float = MAX_TILT
     ) -> View | None:
         """Best plane of a scan that may be ground, or without one the best that is no ceiling."""
-        views, again = tee(self._views(scan, turn, max_tilt))
-        return next((view for view in views if view.tells_height), next(again, None))
+        views = self._views(scan, turn, max_tilt)
+        first = next(views, None)
+        if first is None or first.tells_height:
+            return first
+        return next((view for view in views if view.tells_height), first)
 
     def _views(
         self, scan: Scan, turn: FloatArray = UPRIGHT, max_tilt: float = MAX_TILT

@@ -37,10 +37,11 @@ directions. A scan whose ground is farther from z than that is not levelled but 
 STEEP = math.radians(25.0)
 """Tilt from which a plane is fitted again in a frame in which it is level: lowest points of a
 tilted frame are not all ground."""
-SHEER, CLEARLY, LEAST_EVIDENCE = 1.0, 4.0, 100.0
-"""`GroundPlane.depression` [rad] from which a plane may be a facade beside a sensor on its side:
-upright sensors see ground at up to 0.8. `View.evidence` of another plane over that of the one
-about z, at least 100 m, from which it is the ground: walls and ceilings of rooms have less."""
+GOOD_SUPPORT, TALL = 0.9, 6.0
+"""Support below which a plane this far below z may well be a facade [m]."""
+OTHER_MIN_SUPPORT, OTHER_MIN_REACH = 0.5, 10.0
+"""Support of a plane about another axis, and range that it reaches [m]: walls and ceilings of
+rooms seldom do."""
 LEAST_DEPRESSION, STEEP_DEPRESSION = 0.105, 0.2
 """Angle to the plane at which a sensor sees the nearest of it, at least, and at which no vehicle's
 origin at its axles does [rad]: a sensor on its roof seems to see it at 0.05 to 0.16 from there."""
@@ -113,11 +114,6 @@ class View(NamedTuple):
         return self.plane.support >= MIN_SUPPORT or has_none_below or bool(self.is_mirror)
 
     @property
-    def evidence(self) -> float:
-        """Cells on it, times how far and how obliquely it is seen: facades are near, and sheer."""
-        return self.plane.n_support * self.plane.reach * math.cos(self.plane.depression)
-
-    @property
     def is_dry(self) -> bool:
         """Whether it is known to have no mirror images, and to be none of a polished ceiling."""
         is_no_image = self.plane.overhung < OVERHUNG and self.plane.support >= MIN_SUPPORT
@@ -176,20 +172,25 @@ def is_below_sensor(plane: GroundPlane, scan: Scan) -> bool:
 
 
 def is_doubtful(below: View | None) -> bool:
-    """Whether the plane below z is so poor, or so steeply seen, that z may not be up."""
+    """Whether the plane below z is so poor, or so far away, that z may not be up."""
     if below is None or below.is_steep or not (below.is_well_supported or below.is_whole):
         return True
-    return below.plane.depression > SHEER
+    return below.plane.height > TALL and below.plane.support < GOOD_SUPPORT
 
 
 def clearest(below: View | None, others: Iterable[View | None]) -> View | None:
     """Return the one of `others` that clearly is the ground, if `below`, about z, is not."""
-    least = CLEARLY * max(below.evidence if below is not None else 0.0, LEAST_EVIDENCE)
-    # No ground is above the sensor: roofs of cars, of whose ground little is seen, are.
-    told = (
-        view for view in others if view and view.tells_tilt and view.plane.height >= -MIN_CLEARANCE
-    )
-    return max((v for v in told if v.evidence > least), key=lambda v: v.evidence, default=below)
+    found = [
+        view
+        for view in others
+        if view is not None
+        and view.tells_tilt
+        # No ground is above the sensor: roofs of cars, of whose ground little is seen, are.
+        and -MIN_CLEARANCE <= view.plane.height <= TALL
+        and view.plane.support >= OTHER_MIN_SUPPORT
+        and view.plane.reach >= OTHER_MIN_REACH
+    ]
+    return max(found, key=lambda view: view.plane.support, default=below)
 
 
 @np.errstate(invalid='ignore', over='ignore')
