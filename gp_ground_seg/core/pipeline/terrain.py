@@ -172,12 +172,12 @@ def _in_front(candidates: Candidates, near: IntArray) -> BoolArray:
 
 
 def _groups(n: int, first: IntArray, second: IntArray) -> IntArray:
-    """First member of the group of each of `n`, (n,); those of a pair are in one group."""
-    group = np.arange(n)
-    while ((a := group[first]) != (b := group[second])).any():
-        np.minimum.at(group, np.maximum(a, b), np.minimum(a, b))
-        while (group != (further := group[group])).any():
-            group = further
+    """Group of each of `n` members, (n,), of which those of a pair are in one group."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(first), dtype=np.bool_), (first, second)), shape=(n, n))
+    group: IntArray = connected_components(graph, directed=False)[1]
     return group
 
 
