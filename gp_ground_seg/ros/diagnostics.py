@@ -29,7 +29,6 @@ SLOW = {
     'publish': 'publishing, as when a subscriber is slow',
 }
 """Stages of a cloud, as they are named when they take long."""
-COMPILING = ' while compiling'  # behind the name of the backend that is used until then
 Level = IntEnum('Level', 'OK WARN ERROR STALE', start=0)
 """Severity, with the values of ``diagnostic_msgs/DiagnosticStatus``."""
 
@@ -177,17 +176,14 @@ class ProcessingTask:
                 'what sends it is late, or has another clock'
             )
         if n_dropped:
-            faults.append(
-                f'clouds dropped since the last report: {n_dropped}'
-                + f', by {SLOW["total"].format(self._backend)}' * self._backend.endswith(COMPILING)
-            )
+            faults.append(f'clouds dropped since the last report: {n_dropped}')
         self._n_reported = self.n_dropped
         good = 'no cloud processed yet' if latency is None else f'median latency {latency:.1f} ms'
         values = {
             'Clouds since startup': str(self.n_processed),
             'Dropped since startup': str(self.n_dropped),
             'Median latency (ms)': _digits(latency, '.2f'),
-            'Backend': self._backend.removesuffix(COMPILING),
+            'Backend': self._backend,
             'Age of transform (s)': _digits(self._age, '.3f'),
         }
         return judged('processing', faults, good, values)
@@ -276,15 +272,10 @@ class Diagnostics:
             self._timer.reset()
 
     def published(
-        self,
-        scan: Segmentation,
-        arrival: float,
-        stages: Mapping[str, float],
-        age: float | None,
-        is_compiling: bool,
+        self, scan: Segmentation, arrival: float, stages: Mapping[str, float], age: float | None
     ) -> None:
         """Count the cloud that came at `arrival` [s], as in `processed`; log its stages."""
-        logger, backend = self._node.get_logger(), scan.backend + COMPILING * is_compiling
+        logger, backend = self._node.get_logger(), scan.backend
         times = ', '.join(f'{name} {1e3 * seconds:.2f}' for name, seconds in stages.items())
         logger.debug(f'times of the stages [ms]: {times}')
         if self._newest is None:

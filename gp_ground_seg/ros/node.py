@@ -131,8 +131,7 @@ class GroundSegmentationNode(ConfiguredNode):
         publishing, waited = time.monotonic() - segmented, frames.waited
         stages = {'queue': start - arrival - waited, 'frames': waited, **result.timings}
         stages['publish'] = publishing
-        is_compiling = self._loader is not None and not self._loader.is_done
-        self._diagnostics.published(result, arrival, stages, frames.age, is_compiling)
+        self._diagnostics.published(result, arrival, stages, frames.age)
 
     def _why_idle(self) -> str:
         """Why no clouds are wanted now; empty if they are."""
