@@ -68,14 +68,15 @@ def _mark_scattered(
         low, high = np.float64(tiles.extremes[t, 0]), np.float64(tiles.extremes[t, 1])
         if faces.is_face[t]:
             continue
+        scatter = plain.scatter_square(sums[k])
+        if abs(low + height) < face and high - low <= face:
+            own[n_own] = scatter
+            n_own += 1
         if low + height > 0.5 * face:
-            raised[n], square[n] = t, plain.scatter_square(sums[k])
+            raised[n], square[n] = t, scatter
             for i in range(np.uintp(plain.SUMS)):
                 sums[n, i] = sums[k, i]
             n += 1
-        elif low + height > -0.5 * face and high - low <= face:
-            own[n_own] = plain.scatter_square(sums[k])
-            n_own += 1
     _, counts = levels_of(own[:n_own], plain.SQUARE_SCATTERS)
     limit = plain.smooth_up_to(plain.SCATTER[level_at(counts, counts.sum(), plain.OWN_SHARE)])
     place, level = tiles.place[raised[:n]], np.empty(n, np.int32)

@@ -48,16 +48,17 @@ FIRST = ~3
 UNITS_PER_METRE = 2.0**16
 """Coordinates are rounded to units of 15 um: squares and products within a block of tiles, and
 sums of two thousand of them, are exact up to 30 m over the own level: no order matters."""
-MIN_WIDTH = 0.05
+MIN_WIDTH, IN_BEAM = 0.05, 0.001
 """Least standard deviation of the returns of a tile, in all directions but one, of which the
-scatter about their plane is known [m]: more than that of one ring by noise of its ranges."""
+scatter about their plane is known [m], and least of that: those of one ring lie in the plane of
+its rays, however rough the ground is."""
 SCATTER = 0.25 * ROUGHNESS
 SQUARE_SCATTERS = SQUARE_EDGES / 16.0
 """Scatter about a plane of each level of `gp_ground_seg.core.pipeline.roughness`, and the squares
 between them [m, m^2]."""
 SCATTERED = Window(2, 0.75, 4)
 """Window of the raised tiles among which many may scatter: of 6 m, for tiles of 0.5 m."""
-SMOOTH, TIMES_OWN, OWN_SHARE = 0.0265, 4.5, 0.75
+SMOOTH, TIMES_OWN, OWN_SHARE = 0.0265, 4.5, 0.65
 """Scatter up to which terrain is smooth [m]: that of KITTI has 0.003 to 0.02, beds and stairs 0.03
 to 0.06; what it may be as a multiple of that of the own level, of which this share is smoother."""
 STEPS, AS_EVEN = 0.05, 1.25
@@ -140,7 +141,7 @@ def _scattered(
     `sums`, (SUMS, K), are over their returns; for the others see `is_examined`.
     """
     square, face = scatter_square(sums), face_height(label)
-    is_own = ~is_face & (np.abs(over) < 0.5 * face) & (extent <= face)
+    is_own = ~is_face & (np.abs(over) < face) & (extent <= face)
     level = np.searchsorted(SQUARE_SCATTERS, square[is_own & (square != UNKNOWN)], side='right')
     counts = np.bincount(level, minlength=N_LEVELS)[None, :]
     limit = smooth_up_to(SCATTER[level_at(counts, OWN_SHARE)[0]])
@@ -179,7 +180,7 @@ def is_examined(extent: Values, over: Values, place: Values, label: LabelConfig)
     beyond `FARTHEST`: squares there may exceed all numbers.
     """
     face = face_height(label)
-    is_sample = (place % SAMPLED == 0) & (over > -0.5 * face)
+    is_sample = (place % SAMPLED == 0) & (over > -face)
     return ((extent > face) | (over > 0.5 * face) | is_sample) & (np.abs(over) < FARTHEST)
 
 
@@ -251,7 +252,7 @@ def scatter_square(sums: FloatArray) -> Values:
     """Mean square of the returns of a tile about the plane through them [m^2].
 
     It is the determinant of their scatter over the sum of its minors: nearly the least eigenvalue,
-    as the two others are larger. `UNKNOWN` of few returns, and of those in a line.
+    as the two others are larger. `UNKNOWN` of few returns, and of those of one ring.
     For the sums see `moments`.
     """
     n, xx, yy, zz, xy, xz, yz = moments(sums)
@@ -259,8 +260,8 @@ def scatter_square(sums: FloatArray) -> Values:
     minors = a + b + c
     determinant = xx * a - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
     is_known = (n >= MIN_RETURNS) & (minors > n * MIN_WIDTH * MIN_WIDTH * (xx + yy + zz))
-    square = np.maximum(determinant, 0.0) / (n * choose(is_known, minors, 1.0))
-    return choose(is_known, square, UNKNOWN)
+    square = determinant / (n * choose(is_known, minors, 1.0))
+    return choose(is_known & (square > IN_BEAM * IN_BEAM), square, UNKNOWN)
 
 
 @shared
