@@ -61,9 +61,9 @@ SCATTERED = Window(2, 0.75, 4)
 SMOOTH, TIMES_OWN, OWN_SHARE = 0.0265, 4.5, 0.65
 """Scatter up to which terrain is smooth [m]: that of KITTI has 0.003 to 0.02, beds and stairs 0.03
 to 0.06; what it may be as a multiple of that of the own level, of which this share is smoother."""
-STEPS, AS_EVEN = 0.05, 1.25
-"""Scatter of stairs about their plane [m], of steps of 0.2 m; most that it is over 2 m, as a
-multiple of that over 1 m: of stairs 1.0 to 1.2, of rough banks 1.5."""
+STEPS, AS_EVEN = (0.0215, 0.05), 1.2
+"""Least and largest scatter of stairs about their plane [m], of steps of 0.1 to 0.2 m; most that it
+is over 2 m, as a multiple of that over 1 m: of stairs 1.0 to 1.2, of rough banks 1.5."""
 STAIRS_UP = 0.76, 0.94
 """Vertical components of the normal of what is as steep as stairs: 20 to 41 degrees."""
 SAMPLED = 2
@@ -281,11 +281,11 @@ def vote_on_scatter(square: Values, small: Values, large: Values, limit: float) 
     show one step alone, but a block scatters as much as one twice as large: both lie on one plane.
     With one ring a step 1 m may be smooth; where 2 m scatter as stairs do, that tells nothing.
     """
-    smooth, steps = SMOOTH * SMOOTH, STEPS * STEPS
-    even = np.minimum(steps, AS_EVEN * AS_EVEN * small)
-    is_stepped = (small > smooth) & (large > 0.0) & (large < even)
-    is_block_smooth = (small != UNKNOWN) & (small <= smooth)
-    is_smooth = (square != UNKNOWN) | (is_block_smooth & ((large <= smooth) | (large >= steps)))
+    least, most = STEPS[0] * STEPS[0], STEPS[1] * STEPS[1]
+    even = np.minimum(most, AS_EVEN * AS_EVEN * small)
+    is_stepped = (small > least) & (large > least) & (large < even)
+    is_block_smooth = (small != UNKNOWN) & (small <= SMOOTH * SMOOTH)
+    is_smooth = (square != UNKNOWN) | (is_block_smooth & ((large <= least) | (large >= most)))
     return choose(is_stepped | (square > limit * limit), 1, choose(is_smooth, 0, UNKNOWN_LEVEL))
 
 
