@@ -69,7 +69,7 @@ def _mark_scattered(
         if faces.is_face[t]:
             continue
         scatter = plain.scatter_square(sums[k])
-        if abs(low + height) < face and high - low <= face:
+        if plain.is_of_own_level(high - low, low + height, label):
             own[n_own] = scatter
             n_own += 1
         if low + height > 0.5 * face:

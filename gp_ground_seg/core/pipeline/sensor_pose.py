@@ -39,8 +39,9 @@ REFERENCE_HEIGHT = 1.0
 """Height of a sensor over the ground from which parameters are used as they are given [m]."""
 LOWEST = 0.1
 """Height below which the origin of a cloud is no sensor [m]."""
-LEAST_TOLERANCE = 0.04
-"""Least tolerance of ground that a low sensor leads to [m]: twice the noise of its ranges."""
+LEAST_TOLERANCE, NEARER = 0.04, 0.6
+"""Least tolerance of ground that a low sensor leads to [m]: twice the noise of its ranges; factor
+of its `grid.r_min`, of 1.2 times its height: a dome sees the ground that near."""
 
 
 @dataclass(frozen=True)
@@ -264,14 +265,14 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
     if share >= 1.0 or config.label.rule != 'roughness':
         return config
     names = (
-        'grid.r_min',
         'growth.seed_height_tolerance',
         'growth.max_std',
         'label.ground_tolerance',
         'label.obstacle_min_height',
         'observation.slope_drift',
     )
-    shares = dict.fromkeys(names, share) | {'observation.sigma_n': math.sqrt(share)}
+    shares = dict.fromkeys(names, share)
+    shares |= {'observation.sigma_n': math.sqrt(share), 'grid.r_min': NEARER * share}
     least = {name: float(Config.find_spec(name).minimum or 0.0) for name in shares}
     least['label.ground_tolerance'] = min(LEAST_TOLERANCE, config.label.ground_tolerance)
     return config.replace(**{k: max(v * config[k], least[k]) for k, v in shares.items()})

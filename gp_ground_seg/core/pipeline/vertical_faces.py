@@ -58,7 +58,7 @@ SQUARE_SCATTERS = SQUARE_EDGES / 16.0
 between them [m, m^2]."""
 SCATTERED = Window(2, 0.75, 4)
 """Window of the raised tiles among which many may scatter: of 6 m, for tiles of 0.5 m."""
-SMOOTH, TIMES_OWN, OWN_SHARE = 0.0265, 4.5, 0.65
+SMOOTH, TIMES_OWN, OWN_SHARE = 0.0265, 4.5, 0.75
 """Scatter up to which terrain is smooth [m]: that of KITTI has 0.003 to 0.02, beds and stairs 0.03
 to 0.06; what it may be as a multiple of that of the own level, of which this share is smoother."""
 STEPS, AS_EVEN = (0.0215, 0.05), 1.2
@@ -66,8 +66,9 @@ STEPS, AS_EVEN = (0.0215, 0.05), 1.2
 is over 2 m, as a multiple of that over 1 m: of stairs 1.0 to 1.2, of rough banks 1.5."""
 STAIRS_UP = 0.76, 0.94
 """Vertical components of the normal of what is as steep as stairs: 20 to 41 degrees."""
-SAMPLED = 2
-"""One in so many tiles of the own level tells how much it scatters."""
+SAMPLED, OWN_BAND = 2, 0.6
+"""One in so many tiles of the own level tells how much it scatters; height up to which a tile is of
+it, either way, in heights of a face: with 1 beds are, with 0.5 little of rough land is."""
 
 SUMS = 10
 """Rows of the sums over returns: number, x, y, z, their squares, x y, x z, y z."""
@@ -141,8 +142,8 @@ def _scattered(
     `sums`, (SUMS, K), are over their returns; for the others see `is_examined`.
     """
     square, face = scatter_square(sums), face_height(label)
-    is_own = ~is_face & (np.abs(over) < face) & (extent <= face)
-    level = np.searchsorted(SQUARE_SCATTERS, square[is_own & (square != UNKNOWN)], side='right')
+    is_known = ~is_face & is_of_own_level(extent, over, label) & (square != UNKNOWN)
+    level = np.searchsorted(SQUARE_SCATTERS, square[is_known], side='right')
     counts = np.bincount(level, minlength=N_LEVELS)[None, :]
     limit = smooth_up_to(SCATTER[level_at(counts, OWN_SHARE)[0]])
     raised = np.flatnonzero(~is_face & (over > 0.5 * face))
@@ -180,8 +181,15 @@ def is_examined(extent: Values, over: Values, place: Values, label: LabelConfig)
     beyond `FARTHEST`: squares there may exceed all numbers.
     """
     face = face_height(label)
-    is_sample = (place % SAMPLED == 0) & (over > -face)
+    is_sample = (place % SAMPLED == 0) & is_of_own_level(extent, over, label)
     return ((extent > face) | (over > 0.5 * face) | is_sample) & (np.abs(over) < FARTHEST)
+
+
+@shared
+def is_of_own_level(extent: Values, over: Values, label: LabelConfig) -> Values:
+    """Whether the scatter of a tile may tell how much the own level does; see `is_examined`."""
+    face = face_height(label)
+    return (np.abs(over) < OWN_BAND * face) & (extent <= face)
 
 
 @shared
