@@ -287,14 +287,12 @@ def vote_on_scatter(square: Values, small: Values, large: Values, limit: float) 
 
     Squares of the scatter are of the tile, and of blocks of 1 and 2 m [m^2]. A tile of stairs may
     show one step alone, but a block scatters as much as one twice as large: both lie on one plane.
-    With one ring a step 1 m may be smooth; where 2 m scatter as stairs do, that tells nothing.
     """
     least, most = STEPS[0] * STEPS[0], STEPS[1] * STEPS[1]
     even = np.minimum(most, AS_EVEN * AS_EVEN * small)
     is_stepped = (small > least) & (large > least) & (large < even)
-    is_block_smooth = (small != UNKNOWN) & (small <= SMOOTH * SMOOTH)
-    is_smooth = (square != UNKNOWN) | (is_block_smooth & ((large <= least) | (large >= most)))
-    return choose(is_stepped | (square > limit * limit), 1, choose(is_smooth, 0, UNKNOWN_LEVEL))
+    is_rough = is_stepped | (square > limit * limit)
+    return choose(is_rough, 1, choose(square != UNKNOWN, 0, UNKNOWN_LEVEL))
 
 
 @shared
