@@ -175,7 +175,9 @@ def is_doubtful(below: View | None) -> bool:
     """Whether the plane below z is so poor, or so far away, that z may not be up."""
     if below is None or below.is_steep or not (below.is_well_supported or below.is_whole):
         return True
-    return below.plane.height > TALL and below.plane.support < GOOD_SUPPORT
+    # A cone of tops, seen by the highest beam alone, may look whole.
+    least = MIN_SUPPORT if below.plane.depression < LEAST_DEPRESSION else 0.0
+    return below.plane.support < (GOOD_SUPPORT if below.plane.height > TALL else least)
 
 
 def clearest(below: View | None, others: Iterable[View | None]) -> View | None:
