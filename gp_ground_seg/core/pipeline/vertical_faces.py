@@ -62,13 +62,13 @@ SMOOTH, TIMES_OWN, OWN_SHARE = 0.0265, 4.5, 0.75
 """Scatter up to which terrain is smooth [m]: that of KITTI has 0.003 to 0.02, beds and stairs 0.03
 to 0.06; what it may be as a multiple of that of the own level, of which this share is smoother."""
 STEPS, AS_EVEN = (0.0215, 0.05), 1.2
-"""Least and largest scatter of stairs about their plane [m], of steps of 0.1 to 0.2 m; most that it
-is over 2 m, as a multiple of that over 1 m: of stairs 1.0 to 1.2, of rough banks 1.5."""
+"""Least and largest scatter of stairs about their plane [m], of steps of 0.1 to 0.2 m; most that
+it is over 2 m, as a multiple of that over 1 m: of stairs 1.0 to 1.2, of rough banks 1.5."""
 STAIRS_UP = 0.76, 0.94
 """Vertical components of the normal of what is as steep as stairs: 20 to 41 degrees."""
 SAMPLED, OWN_BAND = 2, 0.6
-"""One in so many tiles of the own level tells how much it scatters; height up to which a tile is of
-it, either way, in heights of a face: with 1 beds are, with 0.5 little of rough land is."""
+"""One in so many tiles of the own level tells how much it scatters; height up to which a tile is
+of it, either way, in heights of a face: with 1 beds are, with 0.5 little of rough land is."""
 
 SUMS = 10
 """Rows of the sums over returns: number, x, y, z, their squares, x y, x z, y z."""
