@@ -264,15 +264,15 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
     share = sensor_height_of(pose) / REFERENCE_HEIGHT
     if share >= 1.0 or config.label.rule != 'roughness':
         return config
-    names = (
-        'growth.seed_height_tolerance',
-        'growth.max_std',
-        'label.ground_tolerance',
-        'label.obstacle_min_height',
-        'observation.slope_drift',
-    )
-    shares = dict.fromkeys(names, share)
-    shares |= {'observation.sigma_n': math.sqrt(share), 'grid.r_min': NEARER * share}
+    shares = {
+        'grid.r_min': NEARER * share,
+        'growth.seed_height_tolerance': share,
+        'growth.max_std': share,
+        'label.ground_tolerance': share,
+        'label.obstacle_min_height': share,
+        'observation.slope_drift': share,
+        'observation.sigma_n': math.sqrt(share),
+    }
     least = {name: float(Config.find_spec(name).minimum or 0.0) for name in shares}
     least['label.ground_tolerance'] = min(LEAST_TOLERANCE, config.label.ground_tolerance)
     return config.replace(**{k: max(v * config[k], least[k]) for k, v in shares.items()})
