@@ -352,5 +352,6 @@ def test_real_frames(kitti, first):
             np.testing.assert_allclose(
                 (lean.roll - base.roll, lean.pitch - base.pitch), (0.1, -0.08), atol=0.02
             )
-        with pytest.raises(PointCloudError, match=f'with {up} nearest to up'):
-            pose_of(tilted(points, *angles))
+        for axis, turn in ((up, angles), ('-z', (3.0, 0.1))):
+            with pytest.raises(PointCloudError, match=f'with {axis} nearest to up'):
+                pose_of(tilted(points, *turn))
