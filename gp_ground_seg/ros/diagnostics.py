@@ -137,6 +137,8 @@ class InputTask:
 class ProcessingTask:
     """Latency and losses."""
 
+    is_compiling = False  # whether clouds are segmented with numpy until compiled code is there
+
     def __init__(self) -> None:
         # Of the newest clouds, from arrival to publication, and of each stage in `SLOW` [s].
         self._latencies: deque[float] = deque(maxlen=CLOUD_WINDOW)
@@ -162,13 +164,13 @@ class ProcessingTask:
         """Judge the latest clouds, and the losses since the last report."""
         latency = 1e3 * float(np.median(self._latencies)) if self._latencies else None
         limit, n_dropped = 1e3 * limits.max_latency, self.n_dropped - self._n_reported
-        faults = []
+        faults, meanwhile = [], ' while compiling' * self.is_compiling
         if latency is not None and latency > limit:
             times = zip(1e3 * np.median(self._stages, axis=0), SLOW.values(), strict=True)
             longest, stage = max(times)
             faults.append(
                 f'median latency {latency:.0f} ms, above {limit:g} ms, of it {longest:.0f} ms '
-                f'{stage.format(self._backend)}'
+                f'{stage.format(self._backend + meanwhile)}'
             )
         if self._age is not None and self._age > MAX_AGE:
             faults.append(
@@ -176,7 +178,7 @@ class ProcessingTask:
                 'what sends it is late, or has another clock'
             )
         if n_dropped:
-            faults.append(f'clouds dropped since the last report: {n_dropped}')
+            faults.append(f'clouds dropped since the last report: {n_dropped}{meanwhile}')
         self._n_reported = self.n_dropped
         good = 'no cloud processed yet' if latency is None else f'median latency {latency:.1f} ms'
         values = {

@@ -128,6 +128,9 @@ def test_processing_has_the_median_latency_and_a_slow_one_is_a_warning():
         report = process(statistics, 100 * [0.2], stage).report(LIMITS)
         said = f'median latency 200 ms, above 100 ms, of it 160 ms {name.format("numba")}'
         assert (report.level, report.message) == (Level.WARN, said)
+    statistics.is_compiling = True
+    report = process(statistics, 100 * [0.2]).report(LIMITS)
+    assert report.message.endswith('160 ms segmentation with numba while compiling')
     # Late TF is said, whatever the latency.
     for age, level in ((0.04, Level.OK), (0.4, Level.WARN)):
         report = process(ProcessingTask(), [0.01], age=age).report(LIMITS)
