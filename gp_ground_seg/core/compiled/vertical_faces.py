@@ -69,7 +69,7 @@ def _mark_scattered(
         if faces.is_face[t]:
             continue
         scatter = plain.scatter_square(sums[k])
-        if plain.is_of_own_level(high - low, low + height, label):
+        if scatter > plain.ONE_RING and plain.is_of_own_level(high - low, low + height, label):
             own[n_own] = scatter
             n_own += 1
         if low + height > 0.5 * face:

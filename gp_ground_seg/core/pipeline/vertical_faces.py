@@ -48,10 +48,10 @@ FIRST = ~3
 UNITS_PER_METRE = 2.0**16
 """Coordinates are rounded to units of 15 um: squares and products within a block of tiles, and
 sums of two thousand of them, are exact up to 30 m over the own level: no order matters."""
-MIN_WIDTH, IN_BEAM = 0.05, 0.001
+MIN_WIDTH, ONE_RING = 0.05, 0.001**2
 """Least standard deviation of the returns of a tile, in all directions but one, of which the
-scatter about their plane is known [m], and least of that: those of one ring lie in the plane of
-its rays, however rough the ground is."""
+scatter about their plane is known [m]; square of that up to which it tells nothing of the own
+level [m^2]: a ring lies in the plane of its rays, however rough the ground is."""
 SCATTER = 0.25 * ROUGHNESS
 SQUARE_SCATTERS = SQUARE_EDGES / 16.0
 """Scatter about a plane of each level of `gp_ground_seg.core.pipeline.roughness`, and the squares
@@ -142,7 +142,7 @@ def _scattered(
     `sums`, (SUMS, K), are over their returns; for the others see `is_examined`.
     """
     square, face = scatter_square(sums), face_height(label)
-    is_known = ~is_face & is_of_own_level(extent, over, label) & (square != UNKNOWN)
+    is_known = ~is_face & is_of_own_level(extent, over, label) & (square > ONE_RING)
     level = np.searchsorted(SQUARE_SCATTERS, square[is_known], side='right')
     counts = np.bincount(level, minlength=N_LEVELS)[None, :]
     limit = smooth_up_to(SCATTER[level_at(counts, OWN_SHARE)[0]])
@@ -260,7 +260,7 @@ def scatter_square(sums: FloatArray) -> Values:
     """Mean square of the returns of a tile about the plane through them [m^2].
 
     It is the determinant of their scatter over the sum of its minors: nearly the least eigenvalue,
-    as the two others are larger. `UNKNOWN` of few returns, and of those of one ring.
+    as the two others are larger. `UNKNOWN` of few returns, and of those in a line.
     For the sums see `moments`.
     """
     n, xx, yy, zz, xy, xz, yz = moments(sums)
@@ -268,8 +268,8 @@ def scatter_square(sums: FloatArray) -> Values:
     minors = a + b + c
     determinant = xx * a - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
     is_known = (n >= MIN_RETURNS) & (minors > n * MIN_WIDTH * MIN_WIDTH * (xx + yy + zz))
-    square = determinant / (n * choose(is_known, minors, 1.0))
-    return choose(is_known & (square > IN_BEAM * IN_BEAM), square, UNKNOWN)
+    square = np.maximum(determinant, 0.0) / (n * choose(is_known, minors, 1.0))
+    return choose(is_known, square, UNKNOWN)
 
 
 @shared
