@@ -334,14 +334,11 @@ def test_stairs_with_a_landing_are_no_ramp(at):
     assert not (cells[:, int(10 * at) + 3 :] == costmap.FREE).any()
 
 
-@pytest.mark.parametrize(  # unknown where nothing of the own level is seen before them
-    ('at', 'name', 'tells'),
-    [(0.7, 'os0-64', np.isnan), (1.2, 'os0-64', np.isfinite), (0.5, 'os0-64 low', np.isfinite)],
-)
-def test_stairs_of_which_each_step_is_seen_and_allowed_are_a_drop(at, name, tells):
+@pytest.mark.parametrize(('at', 'name'), [(0.75, 'os0-64'), (1.2, 'os0-64'), (0.5, 'os0-64 low')])
+def test_stairs_of_which_each_step_is_seen_and_allowed_are_a_drop(at, name):
     corners = [(at + 0.29 * (k // 2), -0.17 * (k - k // 2)) for k in range(16)]
     ranges, cells = ranges_and_cells(polyline(0.0, corners), name)
-    assert tells(ranges[AHEAD]).mean() > 0.9
+    assert np.isfinite(ranges[AHEAD]).mean() > 0.9
     assert (cells[:, int(10 * at) + 3 : 20] == costmap.FREE).mean() < 0.05
 
 

@@ -39,9 +39,8 @@ REFERENCE_HEIGHT = 1.0
 """Height of a sensor over the ground from which parameters are used as they are given [m]."""
 LOWEST = 0.1
 """Height below which the origin of a cloud is no sensor [m]."""
-LEAST_TOLERANCE, NEARER = 0.04, 0.6
-"""Least tolerance of ground that a low sensor leads to [m]: twice the noise of its ranges; factor
-of its `grid.r_min`, of 1.2 times its height: a dome sees the ground that near."""
+LEAST_TOLERANCE = 0.04
+"""Least tolerance of ground that a low sensor leads to [m]: twice the noise of its ranges."""
 
 
 @dataclass(frozen=True)
@@ -265,7 +264,7 @@ def for_sensor(config: Config, pose: SensorPose) -> Config:
     if share >= 1.0 or config.label.rule != 'roughness':
         return config
     shares = {
-        'grid.r_min': NEARER * share,
+        'grid.r_min': share,
         'growth.seed_height_tolerance': share,
         'growth.max_std': share,
         'label.ground_tolerance': share,
