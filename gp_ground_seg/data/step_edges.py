@@ -53,9 +53,9 @@ WIDEST, SLOPE_NOISE, LEAST_ON_PLANE = 0.1, 0.006, 0.4
 """Slope by which ground may be off that plane in the first and in the last round; least share of
 the ground that is off by less than twice the last."""
 
-MAX_APART, SAME_EDGE = 3, 0.12
+MAX_APART, SAME_EDGE, STAIR = 3, 0.12, 0.3
 """Most sectors from one step of an edge to the next, and the share of its range by which the edge
-may recede from sector to sector."""
+may recede from sector to sector, besides one step of stairs [m]."""
 MIN_STEPS, MIN_WIDTH, MIN_STRONG = 3, 1.0, 0.25
 """Least number of steps of an edge, least width [m], and least share of steps that are larger than
 the largest allowed one."""
@@ -208,6 +208,8 @@ def find_edges(
         if _is_edge(steps.where(members), r[kept & is_blind], ramp, max_step_down):
             edges.r[kept], edges.z[kept] = r[kept], returns.z[steps.upper[step[kept]]]
             edges.goes_on[kept] = gap[step[kept]] > 0
+    # An edge of ground that an allowed step leads to is certain.
+    edges.first[edges.z > -height - max_step_down] = np.inf
     return edges
 
 
@@ -253,9 +255,8 @@ def _hide(edges: Edges, returns: _Returns, steps: _Steps, max_step_down: float) 
         depth = z[upper] - z[lower]
         if depth < min(LEAST_HIDDEN * returns.sight[lower], WEAK * max_step_down):
             continue
-        start, behind = starts[sector], slice(lower, starts[sector + 1])
-        is_level = abs(z[start : upper + 1] - z[start]) < ON_LEVEL
-        edges.is_before[returns.point[start + 1 : upper + 1]] |= is_level[1:]
+        before, behind = slice(starts[sector] + 1, upper + 1), slice(lower, starts[sector + 1])
+        edges.is_before[returns.point[before]] |= abs(z[before] - z[0]) < ON_LEVEL
         is_back = returns.is_ground[behind] & (z[behind] > z[upper] - max_step_down)
         until = r[lower + is_back.argmax()] if is_back.any() else FARTHEST
         edges.hidden[sector, int(r[upper] / BIN) + 1 : int(until / BIN)] = True
@@ -416,7 +417,7 @@ def _group(steps: _Steps, far: FloatArray, is_blind: BoolArray) -> tuple[IntArra
     gap = (np.roll(sector, -1) - sector) % SECTORS
     n_seen = np.cumsum(np.tile(~is_blind, 2))
     apart: IntArray = n_seen[sector + gap] - n_seen[sector]
-    outer = np.minimum(far, np.roll(far, -1)) * (1.0 + SAME_EDGE * apart) + ON_LEVEL
+    outer = np.minimum(far, np.roll(far, -1)) * (1.0 + SAME_EDGE * apart) + STAIR
     is_near = (apart <= MAX_APART) & (gap > 0) & (2 * gap < SECTORS)
     joined: BoolArray = is_near & (np.maximum(near, np.roll(near, -1)) <= outer)
     ends = np.flatnonzero(~joined)

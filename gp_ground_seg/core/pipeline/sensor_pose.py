@@ -39,8 +39,9 @@ REFERENCE_HEIGHT = 1.0
 """Height of a sensor over the ground from which parameters are used as they are given [m]."""
 LOWEST = 0.1
 """Height below which the origin of a cloud is no sensor [m]."""
-LEAST_TOLERANCE = 0.04
-"""Least tolerance of ground that a low sensor leads to [m]: twice the noise of its ranges."""
+LEAST_TOLERANCE, NEARER = 0.04, 0.6
+"""Least tolerance of ground that a low sensor leads to [m]: twice the noise of its ranges; factor
+of its `grid.r_min`, of 1.2 times its height: a dome sees the ground that near."""
 
 
 @dataclass(frozen=True)
@@ -251,20 +252,17 @@ def _contradictions(sensor: SensorConfig, measured: MeasuredPose, view: View) ->
 
 
 def for_sensor(config: Config, pose: SensorPose) -> Config:
-    """Return `config` with what depends on the height of the sensor in proportion to it.
+    """Return `config` with what depends on the height of a low sensor in proportion to it.
 
     A small robot must stop for objects that a car drives over. Its level beams hit objects at the
     height of the sensor, for example 0.4 m: far from the last ring on the ground, a gate wider
     than that would accept trunks, persons and cars as ground.
-
-    These are gates of the growth, variance of noise, drift of slopes, tolerance of ground, height
-    of obstacles; nothing for one as high as `REFERENCE_HEIGHT`, or not seen to be lower.
     """
     share = sensor_height_of(pose) / REFERENCE_HEIGHT
     if share >= 1.0 or config.label.rule != 'roughness':
         return config
     shares = {
-        'grid.r_min': share,
+        'grid.r_min': NEARER * share,
         'growth.seed_height_tolerance': share,
         'growth.max_std': share,
         'label.ground_tolerance': share,
