@@ -279,7 +279,6 @@ UPS = {
     '-x': (0.0, math.pi / 2),
 }
 
-
 OVER = [('z does not point up: ', f'with {up} nearest to up', turn) for up, turn in UPS.items()]
 LEANING = [
     ('z does not point up: ', '', (math.radians(50.0), 0.0)),
@@ -294,6 +293,7 @@ LEANING = [
         ('urban', SMALL_VLP, OVER, 0.05),
         ('rough', SMALL_OS1, OVER, 0.05),
         ('urban', SMALL_OS1, LEANING, 0.03),
+        ('traffic_jam', SMALL_VLP, OVER[1:], 0.05),  # more of facades is seen
     ],
 )
 def test_z_not_up_is_refused_with_angles_that_can_be_given(scene, sensor, turns, tolerance):

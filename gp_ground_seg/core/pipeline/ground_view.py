@@ -37,11 +37,11 @@ directions. A scan whose ground is farther from z than that is not levelled but 
 STEEP = math.radians(25.0)
 """Tilt from which a plane is fitted again in a frame in which it is level: lowest points of a
 tilted frame are not all ground."""
-GOOD_SUPPORT, TALL = 0.9, 6.0
-"""Support below which a plane this far below z may well be a facade [m]."""
-OTHER_MIN_SUPPORT, OTHER_MIN_REACH = 0.5, 10.0
-"""Support of a plane about another axis, and range that it reaches [m]: walls and ceilings of
-rooms seldom do."""
+SHEER, FAR, CLEARLY, LEAST_EVIDENCE = 1.0, 6.0, 1.5, 20.0
+"""`GroundPlane.depression` [rad] from which a plane may be a facade beside a sensor on its side:
+upright sensors see ground at up to 0.8. Range that another plane reaches, over its height:
+ceilings up to 4. Its `View.evidence`, over that of the plane about z or over the least, from which
+it is the ground."""
 LEAST_DEPRESSION, STEEP_DEPRESSION = 0.105, 0.2
 """Angle to the plane at which a sensor sees the nearest of it, at least, and at which no vehicle's
 origin at its axles does [rad]: a sensor on its roof seems to see it at 0.05 to 0.16 from there."""
@@ -114,6 +114,11 @@ class View(NamedTuple):
         return self.plane.support >= MIN_SUPPORT or has_none_below or bool(self.is_mirror)
 
     @property
+    def evidence(self) -> float:
+        """Cells on it, times their share, times how flatly it is seen: facades are seen sheer."""
+        return self.plane.n_support * self.plane.support * math.cos(self.plane.depression)
+
+    @property
     def is_dry(self) -> bool:
         """Whether it is known to have no mirror images, and to be none of a polished ceiling."""
         is_no_image = self.plane.overhung < OVERHUNG and self.plane.support >= MIN_SUPPORT
@@ -172,27 +177,23 @@ def is_below_sensor(plane: GroundPlane, scan: Scan) -> bool:
 
 
 def is_doubtful(below: View | None) -> bool:
-    """Whether the plane below z is so poor, or so far away, that z may not be up."""
+    """Whether the plane below z is so poor, so steeply seen or so high that z may not be up."""
     if below is None or below.is_steep or not (below.is_well_supported or below.is_whole):
         return True
     # A cone of tops, seen by the highest beam alone, may look whole.
-    least = MIN_SUPPORT if below.plane.depression < LEAST_DEPRESSION else 0.0
-    return below.plane.support < (GOOD_SUPPORT if below.plane.height > TALL else least)
+    least = LEAST_DEPRESSION if below.plane.support < MIN_SUPPORT else -math.inf
+    return not least <= below.plane.depression <= SHEER or below.plane.height < -LOW
 
 
 def clearest(below: View | None, others: Iterable[View | None]) -> View | None:
     """Return the one of `others` that clearly is the ground, if `below`, about z, is not."""
-    found = [
-        view
-        for view in others
-        if view is not None
-        and view.tells_tilt
-        # No ground is above the sensor: roofs of cars, of whose ground little is seen, are.
-        and -MIN_CLEARANCE <= view.plane.height <= TALL
-        and view.plane.support >= OTHER_MIN_SUPPORT
-        and view.plane.reach >= OTHER_MIN_REACH
-    ]
-    return max(found, key=lambda view: view.plane.support, default=below)
+    least = CLEARLY * max(below.evidence if below is not None else 0.0, LEAST_EVIDENCE)
+    # No ground is above the sensor: roofs of cars, of whose ground little is seen, are.
+    told = (
+        view for view in others if view and view.tells_tilt and view.evidence > least
+        and -MIN_CLEARANCE <= view.plane.height <= view.plane.reach / FAR
+    )  # fmt: skip
+    return max(told, key=lambda view: view.evidence, default=below)
 
 
 @np.errstate(invalid='ignore', over='ignore')
@@ -200,9 +201,8 @@ def objection_to_ground(scan: Scan, view: View | None) -> str:
     """Return why a scan that shows this plane, or none, has no ground, or ''."""
     if view is not None and view.turn is UPRIGHT and _shows_lower_ends(view, scan):
         return LOWER_ENDS
-    r = scan.grid.r if view is None or not view.is_surface else scan.grid.r[:0]
-    r = r[np.isfinite(r)]
-    if len(r) == 0:
+    r = scan.grid.r[np.isfinite(scan.grid.r)]
+    if len(r) == 0 or (view is not None and view.is_surface):
         return ''
     nearest, middle, farthest = np.quantile(r, (0.01, 0.5, 0.99)).tolist()
     if farthest < TINY or (middle > HUGE and farthest > UNEQUAL * nearest):
@@ -250,8 +250,8 @@ def refusal(view: View, given: FloatArray) -> str:
     axis = f'{"-" if up[largest] < 0.0 else ""}{"xyz"[largest]}'
     tilt = math.degrees(math.acos(np.clip(up[2], -1.0, 1.0)))
     problem = f'z is tilted by {tilt:.0f} degrees' if axis == 'z' else 'z does not point up'
-    height = view.plane.height * view.plane.normal[2]
     return (
-        f'{problem}: the ground seems to be {height:.2f} m away with {axis} nearest to up; turn '
-        f'the cloud, or set sensor.roll to {roll:.3f} and sensor.pitch to {pitch:.3f} [rad]'
+        f'{problem}: the ground seems to be {view.plane.height * view.plane.normal[2]:.2f} m away '
+        f'with {axis} nearest to up; turn the cloud, or set sensor.roll to {roll:.3f} and '
+        f'sensor.pitch to {pitch:.3f} [rad]'
     )
