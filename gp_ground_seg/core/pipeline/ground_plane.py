@@ -38,9 +38,9 @@ APART = 0.3
 OTHER_SHARE = 0.05
 """Score of another level, by points off the best one, over that of the best one from which it
 counts: little is seen of a path between platforms, or of the top of a dock."""
-TIGHT = 0.8
-"""Support of another level over the weights of all points within the tolerance, from which it may
-be the own one: desks and cars are of many heights."""
+TIGHT = 0.65
+"""Support of another level, over its levelness and the weights of all points within the tolerance,
+from which it may be the own one: desks and cars are of many heights."""
 OWN = 0.41
 """`asideness` of another level, over that of the best one, below which it is the own one: 0.00 to
 0.40 on paths and docks, mostly 0.43 and more of roofs in a jam."""
@@ -169,7 +169,7 @@ def own_level(
     other, score, support = best_of(others, cells, weight, OTHER_SHARE * best_score)
     from_other = np.abs(distance(x, y, z, other))
     whole = weight[from_other * inverse <= 1.0].sum()
-    if support > TIGHT * RESOLUTION * whole:
+    if support > TIGHT * RESOLUTION * levelness(other[1], other[2]) * whole:
         if asideness(cells, other, best) < OWN * asideness(cells, best, other):
             best, other, d, from_other = other, best, from_other, d
         inverse = inverse * (d <= from_other)
@@ -205,17 +205,16 @@ def hypotheses(cells: LowestPoints, max_slope: float) -> FloatArray:
 def other_levels(best: Plane, cells: LowestPoints, is_left: BoolArray) -> FloatArray:
     """Planes through some of the points, clearly over or below the best one, (P, 3).
 
-    They are parallel to it, or level if its tilt may come from lying on several levels.
+    They are parallel to it, and level if its tilt may come from lying on several levels.
     """
-    slope_x, slope_y = best[1], best[2]
-    if math.hypot(slope_x, slope_y) < STRAIGHT:
-        slope_x, slope_y = 0.0, 0.0
-    height = -distance(cells.x, cells.y, cells.z, (0.0, slope_x, slope_y))[is_left]
-    height = height[:: 1 + len(height) // N_LEVEL]
+    points = np.flatnonzero(is_left)[:: 1 + np.count_nonzero(is_left) // N_LEVEL]
+    may_be_level = math.hypot(best[1], best[2]) < STRAIGHT
+    tilt = np.repeat(np.array([1.0, 0.0])[: 1 + may_be_level], len(points))
+    points = np.concatenate((points, points))[: len(tilt)]
+    slope_x, slope_y = best[1] * tilt, best[2] * tilt
+    height = slope_x * cells.x[points] + slope_y * cells.y[points] - cells.z[points]
     may_be = (np.abs(height - best[0]) > APART) & (height > min(best[0], 0.0))
-    height = height[may_be & (height <= MAX_HEIGHT)]
-    tilt = np.ones_like(height)
-    return np.column_stack((height, slope_x * tilt, slope_y * tilt))
+    return np.column_stack((height, slope_x, slope_y))[may_be & (height <= MAX_HEIGHT)]
 
 
 @shared
