@@ -35,15 +35,15 @@ REFUTATION = 8.0
 """Weight of a ray that crosses the plane over that of a point on it at `MIDDLE`."""
 APART = 0.3
 """Distance of two levels, at least [m]."""
-OTHER_SHARE = 0.05
+OTHER_SHARE = 0.1
 """Score of another level, by points off the best one, over that of the best one from which it
 counts: little is seen of a path between platforms, or of the top of a dock."""
 TIGHT = 0.65
 """Support of another level, over its levelness and the weights of all points within the tolerance,
 from which it may be the own one: desks and cars are of many heights."""
-OWN = 0.41
+OWN = 0.4
 """`asideness` of another level, over that of the best one, below which it is the own one: 0.00 to
-0.40 on paths and docks, mostly 0.43 and more of roofs in a jam."""
+0.40 on paths and docks, mostly more of roofs in a jam, and of images below a wet road."""
 STRAY = 0.05
 """Share of the points of a level that may lie farther in a direction than it reaches."""
 LEVEL, STRAIGHT = 1.15, 0.1
@@ -166,13 +166,16 @@ def own_level(
     is_left = (d * inverse > 1.0) & ~cells.is_alone
     weight = cells.weight * is_left
     others = other_levels(best, cells, is_left)
-    other, score, support = best_of(others, cells, weight, OTHER_SHARE * best_score)
+    other, _, support = best_of(others, cells, weight, OTHER_SHARE * best_score)
     from_other = np.abs(distance(x, y, z, other))
     whole = weight[from_other * inverse <= 1.0].sum()
-    if support > TIGHT * RESOLUTION * levelness(other[1], other[2]) * whole:
-        if asideness(cells, other, best) < OWN * asideness(cells, best, other):
+    is_tight = support > TIGHT * RESOLUTION * levelness(other[1], other[2]) * whole
+    if is_tight:
+        is_own = asideness(cells, other, best) < OWN * asideness(cells, best, other)
+        if is_own:
             best, other, d, from_other = other, best, from_other, d
-        inverse = inverse * (d <= from_other)
+        # What lies below the best plane may be images on a wet road.
+        inverse = inverse * ((d <= from_other) | (not is_own and other[0] > best[0]))
     planes = np.array([best, (best[0], 0.0, 0.0)])
     refine(x, y, z, inverse, planes[:1], max_slope, N_REFINEMENTS)
     best = planes[0, 0], planes[0, 1], planes[0, 2]
@@ -180,7 +183,7 @@ def own_level(
         # Low shelves on one side tilt a plane, without more support than a level one has.
         refine(0.0 * x, 0.0 * y, z, inverse, planes[1:], max_slope, N_REFINEMENTS)
         best = best_of(planes, cells, cells.weight, 0.0)[0]
-    return best, other[0] if score > 0.0 else math.inf
+    return best, other[0] if is_tight else math.inf
 
 
 @shared

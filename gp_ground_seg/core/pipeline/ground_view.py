@@ -39,9 +39,8 @@ STEEP = math.radians(25.0)
 tilted frame are not all ground."""
 SHEER, FAR, CLEARLY, LEAST_EVIDENCE = 1.0, 6.0, 1.5, 20.0
 """`GroundPlane.depression` [rad] from which a plane may be a facade beside a sensor on its side:
-upright sensors see ground at up to 0.8. Range that another plane reaches, over its height:
-ceilings up to 4. Its `View.evidence`, over that of the plane about z or over the least, from which
-it is the ground."""
+upright sensors see ground at up to 0.8. Reach of another plane over its height: ceilings up to 4.
+Its `View.evidence`, over that of the one about z or over the least, to be the ground."""
 LEAST_DEPRESSION, STEEP_DEPRESSION = 0.105, 0.2
 """Angle to the plane at which a sensor sees the nearest of it, at least, and at which no vehicle's
 origin at its axles does [rad]: a sensor on its roof seems to see it at 0.05 to 0.16 from there."""
@@ -187,10 +186,10 @@ def is_doubtful(below: View | None) -> bool:
 
 def clearest(below: View | None, others: Iterable[View | None]) -> View | None:
     """Return the one of `others` that clearly is the ground, if `below`, about z, is not."""
-    least = CLEARLY * max(below.evidence if below is not None else 0.0, LEAST_EVIDENCE)
     # No ground is above the sensor: roofs of cars, of whose ground little is seen, are.
     told = (
-        view for view in others if view and view.tells_tilt and view.evidence > least
+        view for view in others if view and view.tells_tilt
+        and view.evidence > CLEARLY * max(below.evidence if below else 0.0, LEAST_EVIDENCE)
         and -MIN_CLEARANCE <= view.plane.height <= view.plane.reach / FAR
     )  # fmt: skip
     return max(told, key=lambda view: view.evidence, default=below)
