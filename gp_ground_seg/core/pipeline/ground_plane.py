@@ -210,9 +210,9 @@ def other_levels(best: Plane, cells: LowestPoints, is_left: BoolArray) -> FloatA
 
     They are parallel to it, and level if its tilt may come from lying on several levels.
     """
-    points = np.flatnonzero(is_left)[:: 1 + np.count_nonzero(is_left) // N_LEVEL]
-    may_be_level = math.hypot(best[1], best[2]) < STRAIGHT
-    tilt = np.repeat(np.array([1.0, 0.0])[: 1 + may_be_level], len(points))
+    tilts = np.array([1.0, 0.0])[: 1 + (math.hypot(best[1], best[2]) < STRAIGHT)]
+    points = np.flatnonzero(is_left)[:: 1 + len(tilts) * np.count_nonzero(is_left) // N_LEVEL]
+    tilt = np.repeat(tilts, len(points))
     points = np.concatenate((points, points))[: len(tilt)]
     slope_x, slope_y = best[1] * tilt, best[2] * tilt
     height = slope_x * cells.x[points] + slope_y * cells.y[points] - cells.z[points]
