@@ -200,10 +200,10 @@ def objection_to_ground(scan: Scan, view: View | None) -> str:
     """Return why a scan that shows this plane, or none, has no ground, or ''."""
     if view is not None and view.turn is UPRIGHT and _shows_lower_ends(view, scan):
         return LOWER_ENDS
-    r = scan.grid.r[np.isfinite(scan.grid.r)]
-    if len(r) == 0 or (view is not None and view.is_surface):
+    r = scan.grid.r[:0] if view is not None and view.is_surface else scan.grid.r
+    if not np.isfinite(r).any():
         return ''
-    nearest, middle, farthest = np.quantile(r, (0.01, 0.5, 0.99)).tolist()
+    nearest, middle, farthest = np.quantile(r[np.isfinite(r)], (0.01, 0.5, 0.99)).tolist()
     if farthest < TINY or (middle > HUGE and farthest > UNEQUAL * nearest):
         return f'half of the returns are within {middle:.3g} m: the cloud is not in metres'
     if nearest > FAR_OFF:
