@@ -116,8 +116,8 @@ def patch(y, height, noise, rise=0.0, apart=0.0):
     [
         (0.005, (0.6, 0.04, 0.0, 0.0), True),  # a bush
         (0.005, (0.6, 0.01, 0.0, 0.0), False),  # a bank
-        (0.005, (0.6, 0.0, 0.16, 0.0), True),  # stairs
-        (0.005, (0.6, 0.0, 0.16, 0.53), True),  # stairs of which a tile shows one step or none
+        # Stairs, and such of which a tile shows one step or none.
+        *((0.005, (0.6, std, 0.16, apart), True) for std in (0.0, 0.003) for apart in (0.0, 0.53)),
         (0.005, (0.2, 0.04, 0.0, 0.0), False),  # tall grass
         (0.005, (-0.6, 0.04, 0.0, 0.0), False),  # a bed below the own level
         (0.03, (0.6, 0.04, 0.0, 0.0), False),  # land that scatters as the own level does
