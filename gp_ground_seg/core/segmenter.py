@@ -10,7 +10,7 @@ import os
 import textwrap
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import islice
+from itertools import chain, islice
 from numbers import Real
 from pathlib import Path
 from time import perf_counter
@@ -153,7 +153,10 @@ class GroundSegmenter:
             if box != NO_BOX:
                 xyz = without_box(xyz, box, _checked_frame(box_frame))
             result = self._segment(xyz, sensor, timer, fallback)
-            self._warn(result.warnings)
+            for line in result.warnings:
+                if line not in self._warned:  # by scans with these parameters
+                    LOGGER.warning(line)
+            self._warned.update(result.warnings)
             return result
 
     def _segment(
@@ -225,13 +228,6 @@ class GroundSegmenter:
         """Use `backend` from the next scan on."""
         with self._exclusive():
             self._backend = backend
-
-    def _warn(self, warnings: tuple[str, ...]) -> None:
-        """Log each warning once, until the parameters change: scans come ten times a second."""
-        for line in warnings:
-            if line not in self._warned:
-                self._warned.add(line)
-                LOGGER.warning(line)
 
     def _exclusive(self) -> threading.RLock:
         """Lock that callers from several threads hold in turn."""
@@ -319,9 +315,7 @@ class GroundSegmenter:
         """Best plane of a scan that may be ground, or without one the best that is no ceiling."""
         views = self._views(scan, turn, max_tilt)
         first = next(views, None)
-        if first is None or first.tells_height:
-            return first
-        return next((view for view in views if view.tells_height), first)
+        return next((view for view in chain([first], views) if view and view.tells_height), first)
 
     def _views(
         self, scan: Scan, turn: FloatArray = UPRIGHT, max_tilt: float = MAX_TILT

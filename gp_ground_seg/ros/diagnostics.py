@@ -17,6 +17,7 @@ from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.point_cloud2 import stamp_of
 from gp_ground_seg.ros.input import STEADY_CLOCK, CloudSubscription
+from gp_ground_seg.ros.loader import BackendLoader
 
 RATE_WINDOW = 10.0  # time over which the rate is taken [s]
 LOG_PERIOD = 60.0  # time between two lines of the log on the clouds so far [s]
@@ -137,7 +138,7 @@ class InputTask:
 class ProcessingTask:
     """Latency and losses."""
 
-    is_compiling = False  # whether clouds are segmented with numpy until compiled code is there
+    loader: BackendLoader | None = None  # of compiled code; until it is done, numpy segments
 
     def __init__(self) -> None:
         # Of the newest clouds, from arrival to publication, and of each stage in `SLOW` [s].
@@ -164,7 +165,7 @@ class ProcessingTask:
         """Judge the latest clouds, and the losses since the last report."""
         latency = 1e3 * float(np.median(self._latencies)) if self._latencies else None
         limit, n_dropped = 1e3 * limits.max_latency, self.n_dropped - self._n_reported
-        faults, meanwhile = [], ' while compiling' * self.is_compiling
+        faults, meanwhile = [], ' while compiling' * bool(self.loader and not self.loader.is_done)
         if latency is not None and latency > limit:
             times = zip(1e3 * np.median(self._stages, axis=0), SLOW.values(), strict=True)
             longest, stage = max(times)

@@ -181,15 +181,13 @@ class GroundSegmentationNode(ConfiguredNode):
             self.get_logger().info(FOLLOWS)
             self._loader = loader = BackendLoader(config, self._loaded.trigger)
             loader.start()
-        is_compiling = is_wanted and loader is not None and not loader.is_done
-        self._diagnostics.processing.is_compiling = is_compiling
+        self._diagnostics.processing.loader = loader if is_wanted else None
 
     def _change_backend(self) -> None:
         """Use the compiled backend from the next cloud on, if the parameters still say so."""
         loader = self._loader
         if loader is None or not loader.is_done:
             return  # it was one that is closed now
-        self._diagnostics.processing.is_compiling = False
         if loader.backend is None:
             self.get_logger().warning(f'{STAYS}: {loader.error}')
             return

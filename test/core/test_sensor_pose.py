@@ -181,6 +181,10 @@ def test_where_the_rays_start_tells_a_floor_from_a_cone_on_the_walls():
     walls = moved(scan_of(ROOM, SMALL_VLP, 1.8).points, 1.0)
     assert not pose_of(walls).height_estimated
     assert not pose_of(walls, origin_z=1.0).height_estimated
+    # The plane is that of the verges of a crowned road, and the first ring lies on a cone.
+    crown = simulation.terrain.polyline(math.pi / 2, [(-4.5, -0.55), (0.0, 0.0), (4.5, -0.55)])
+    own = scan_of(simulation.Scene('crown', crown), SMALL_VLP, 0.3).points
+    assert pose_of(own).starts_rays and not pose_of(moved(own, 0.2)).starts_rays
 
 
 @pytest.mark.parametrize(('sensor', 'degrees'), [(SMALL_HDL, 45), (SMALL_VLP, 35)])

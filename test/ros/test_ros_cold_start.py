@@ -63,9 +63,9 @@ def test_numpy_asked_for_meanwhile_stays_and_the_newest_parameters_hold(held_bac
     with ros.bench(settled=False) as b:
         assert not b.set('grid.n_bins', 90)
         assert backend_after_a_cloud(b, 1) == 'numpy'
-        assert b.node._diagnostics.processing.is_compiling
+        assert not b.node._diagnostics.processing.loader.is_done
         assert not b.set('runtime.backend', 'numpy')
-        assert not b.node._diagnostics.processing.is_compiling
+        assert b.node._diagnostics.processing.loader.is_done
         held_back.set()
         ros.wait_for(lambda: b.node._is_compiled, 'compiled code')
         assert backend_after_a_cloud(b, 2) == 'numpy'

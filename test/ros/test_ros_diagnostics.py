@@ -128,7 +128,7 @@ def test_processing_has_the_median_latency_and_a_slow_one_is_a_warning():
         report = process(statistics, 100 * [0.2], stage).report(LIMITS)
         said = f'median latency 200 ms, above 100 ms, of it 160 ms {name.format("numba")}'
         assert (report.level, report.message) == (Level.WARN, said)
-    statistics.is_compiling = True
+    statistics.loader = SimpleNamespace(is_done=False)
     report = process(statistics, 100 * [0.2]).report(LIMITS)
     assert report.message.endswith('160 ms segmentation with numba while compiling')
     # Late TF is said, whatever the latency.

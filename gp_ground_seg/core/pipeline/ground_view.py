@@ -61,9 +61,10 @@ CUT_TILT, CUT_REACH = 0.08, 20.0
 EDGE = 0.2
 """Height of such a plane over the lowest candidate, at most [m]: of uncut scans outdoors 0.2 to 30
 but on even ground. With few beams things end as much higher than the cut."""
-LAYERS, LEAST_LOWEST = (0.01, 0.05, 0.1, 0.2), 10
+LAYERS, ALL_AROUND = (0.01, 0.05, 0.1, 0.2), 0.35
 """Heights over the lowest candidate of layers of returns [m]: what ends at a cut has about as many
-at all heights; least number in the first layer."""
+at all heights. Share of the sectors with candidates that have one in the third, at least: 0.4 to 1
+of cut clouds; rough paths have up to 0.31, as their hollows lie in a few directions."""
 LOWEST_SHARE, LEAST_SHARE, MOST_SHARE = 0.06, 0.1, 0.7
 """Least share of the third layer that is in the first: cut clouds mostly have 0.06 to 0.33, uneven
 ground 0 to 0.05. Shares of the third in the second, and of the fourth in the third: cut clouds
@@ -166,12 +167,14 @@ def is_below_sensor(plane: GroundPlane, scan: Scan) -> bool:
     """Whether a plane is seen as from a sensor at the origin: steeply, or by a cone of rays."""
     if plane.height < LOW or not LEAST_DEPRESSION <= plane.depression < STEEP_DEPRESSION:
         return plane.depression >= LEAST_DEPRESSION
-    c, steepest = scan.candidates, np.full((N_SECTORS, 2), -np.inf)
+    # Of all returns: lowest points begin at some range, and on a crowned road are off the cone.
+    x, y, z = scan.xyz[scan.grid.r < FARTHEST].T.astype(np.float64)
+    sector = np.floor(np.arctan2(y, x) * (0.5 * N_SECTORS / math.pi)).astype(np.int64)
     # The cone is about z, or about the normal in a cloud that was turned.
-    drop = np.column_stack([-c.z, plane.height - plane.below(c.x, c.y, c.z)])
-    angle = np.arctan2(drop, c.r[:, None])
-    np.maximum.at(steepest, c.segment * N_SECTORS // c.n_segments, angle)
-    low, high = np.quantile(steepest[np.isfinite(steepest[:, 0])], (0.25, 0.75), axis=0)
+    drop, steepest = (-z, plane.height - plane.below(x, y, z)), np.full((2, N_SECTORS), -np.inf)
+    for most, angle in zip(steepest, np.arctan2(drop, np.hypot(x, y)), strict=True):
+        np.maximum.at(most, sector, angle)
+    low, high = np.quantile(steepest[:, np.isfinite(steepest[0])], (0.25, 0.75), axis=1)
     return bool((high - low < ONE_ANGLE * high).any())
 
 
@@ -191,6 +194,8 @@ def clearest(below: View | None, others: Iterable[View | None]) -> View | None:
         view for view in others if view and view.tells_tilt
         and view.evidence > CLEARLY * max(below.evidence if below else 0.0, LEAST_EVIDENCE)
         and -MIN_CLEARANCE <= view.plane.height <= view.plane.reach / FAR
+        # From the axles of a vehicle the crests about it are level, seen upside down.
+        and (view.plane.is_below_sensor or view.up[2] > -math.cos(MAX_TILT))
     )  # fmt: skip
     return max(told, key=lambda view: view.evidence, default=below)
 
@@ -200,8 +205,7 @@ def objection_to_ground(scan: Scan, view: View | None) -> str:
     """Return why a scan that shows this plane, or none, has no ground, or ''."""
     if view is not None and view.turn is UPRIGHT and _shows_lower_ends(view, scan):
         return LOWER_ENDS
-    r = scan.grid.r[:0] if view is not None and view.is_surface else scan.grid.r
-    if not np.isfinite(r).any():
+    if (view and view.is_surface) or not np.isfinite(r := scan.grid.r).any():
         return ''
     nearest, middle, farthest = np.quantile(r[np.isfinite(r)], (0.01, 0.5, 0.99)).tolist()
     if farthest < TINY or (middle > HUGE and farthest > UNEQUAL * nearest):
@@ -234,11 +238,14 @@ def _shows_lower_ends(view: View, scan: Scan) -> bool:
 
 def _is_cut(scan: Scan) -> bool:
     """Whether returns are as many at all heights over the lowest candidate."""
-    low, z = scan.candidates.z.min(), scan.xyz[scan.grid.inside, 2]
+    c, z = scan.candidates, scan.xyz[scan.grid.inside, 2]
+    low, sector = c.z.min(), c.segment * N_SECTORS // c.n_segments
     first, *layers = (np.count_nonzero(z < low + layer) for layer in LAYERS)
-    shares = layers[0] / layers[1], layers[1] / layers[2]
-    is_edge = first >= max(LEAST_LOWEST, LOWEST_SHARE * layers[1])
-    return bool(is_edge and min(shares) >= LEAST_SHARE and max(shares) <= MOST_SHARE)
+    shares = first / layers[1], layers[0] / layers[1], layers[1] / layers[2]
+    is_edge = shares[0] >= LOWEST_SHARE and min(shares[1:]) >= LEAST_SHARE
+    n_around, n_all = (len(np.unique(part)) for part in (sector[c.z < low + LAYERS[2]], sector))
+    is_around = n_around >= ALL_AROUND * n_all
+    return bool(is_edge and is_around and max(shares) <= MOST_SHARE)
 
 
 def refusal(view: View, given: FloatArray) -> str:
