@@ -88,8 +88,7 @@ def desks(gap):
 def test_a_sensor_just_over_table_tops_warns(over, caplog):
     points = scan_of(desks(0.6), SMALL_VLP, 0.74 + over).points
     own = segmenter()
-    results = [own.segment(points) for _ in range(2)]
-    pose = results[0].pose
+    pose, _ = (own.segment(points).pose for _ in range(2))
     assert pose.height == pytest.approx(over, abs=0.04)
     assert pose.warnings == (LOW_GROUND,)
     assert [record.getMessage() for record in caplog.records].count(LOW_GROUND) == 1
@@ -269,10 +268,11 @@ def test_many_cells_tell_the_tilt_among_more_of_other_things():
     assert view.can_level
     assert not view._replace(plane=view.plane._replace(n_support=40)).can_level
     assert not view._replace(plane=view.plane._replace(undercut=0.6)).can_level  # a hillside
-    # Level crests about the axles of a vehicle do not turn z over.
+    # Level crests about the axles of a vehicle do not turn z over, nor roofs.
     plane = GroundPlane(0.1, support=0.4, coverage=1.0, reach=30.0, spread=0.1, n_support=140)
-    seen = View(plane, OTHER_AXES[0]), View(plane._replace(is_below_sensor=True), OTHER_AXES[0])
-    assert clearest(None, seen[:1]) is None and clearest(None, seen) is seen[1]
+    own = plane._replace(is_below_sensor=True)
+    seen = [View(p, OTHER_AXES[0]) for p in (plane, own._replace(undercut=0.4, overhung=0.6), own)]
+    assert clearest(None, seen[:2]) is None and clearest(None, seen) is seen[2]
 
 
 @pytest.mark.parametrize('sensor', [SMALL_VLP, SMALL_OS1], ids=lambda s: s.name)

@@ -64,7 +64,7 @@ but on even ground. With few beams things end as much higher than the cut."""
 LAYERS, ALL_AROUND = (0.01, 0.05, 0.1, 0.2), 0.35
 """Heights over the lowest candidate of layers of returns [m]: what ends at a cut has about as many
 at all heights. Share of the sectors with candidates that have one in the third, at least: 0.4 to 1
-of cut clouds; rough paths have up to 0.31, as their hollows lie in a few directions."""
+of cut clouds, up to 0.31 of rough paths with a few hollows."""
 LOWEST_SHARE, LEAST_SHARE, MOST_SHARE = 0.06, 0.1, 0.7
 """Least share of the third layer that is in the first: cut clouds mostly have 0.06 to 0.33, uneven
 ground 0 to 0.05. Shares of the third in the second, and of the fourth in the third: cut clouds
@@ -194,8 +194,9 @@ def clearest(below: View | None, others: Iterable[View | None]) -> View | None:
         view for view in others if view and view.tells_tilt
         and view.evidence > CLEARLY * max(below.evidence if below else 0.0, LEAST_EVIDENCE)
         and -MIN_CLEARANCE <= view.plane.height <= view.plane.reach / FAR
-        # From the axles of a vehicle the crests about it are level, seen upside down.
-        and (view.plane.is_below_sensor or view.up[2] > -math.cos(MAX_TILT))
+        # Crests about a vehicle's axles are level upside down; roofs have returns on both sides.
+        and (view.up[2] > -math.cos(MAX_TILT) or (view.plane.is_below_sensor
+             and view.plane.undercut * view.plane.overhung < UNDERCUT))
     )  # fmt: skip
     return max(told, key=lambda view: view.evidence, default=below)
 
@@ -244,8 +245,7 @@ def _is_cut(scan: Scan) -> bool:
     shares = first / layers[1], layers[0] / layers[1], layers[1] / layers[2]
     is_edge = shares[0] >= LOWEST_SHARE and min(shares[1:]) >= LEAST_SHARE
     n_around, n_all = (len(np.unique(part)) for part in (sector[c.z < low + LAYERS[2]], sector))
-    is_around = n_around >= ALL_AROUND * n_all
-    return bool(is_edge and is_around and max(shares) <= MOST_SHARE)
+    return bool(is_edge and n_around >= ALL_AROUND * n_all and max(shares) <= MOST_SHARE)
 
 
 def refusal(view: View, given: FloatArray) -> str:
