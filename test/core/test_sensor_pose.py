@@ -122,7 +122,13 @@ def moved(points, lift):
 
 
 @pytest.mark.parametrize(
-    ('scene', 'sensor'), [('kerb', SMALL_HDL), ('rough', SMALL_HDL), ('urban', SMALL_VLP)]
+    ('scene', 'sensor'),
+    [
+        ('kerb', SMALL_HDL),
+        ('rough', SMALL_HDL),
+        ('urban', SMALL_VLP),
+        ('lying_persons', SMALL_VLP),
+    ],
 )
 @pytest.mark.parametrize('height', [0.4, 1.73])
 def test_the_origin_may_be_at_any_height(scene, sensor, height):

@@ -276,8 +276,7 @@ def test_returns_of_a_vehicle_on_a_slope_lie_on_it(name):
     assert above.max() > 0.95 * max(z for _, corners in model.bodies for _, z in corners)
 
 
-# Of each scene the sum of its numbers of solids and objects, of the heights of the lowest and the
-# highest object [m], and of the slopes of half of the ground and of the steepest [degrees].
+# Numbers of solids and objects, and their heights [m] and slopes [degrees] below, added up.
 MEASURES = dict(zip(SCENES, [
     80, 88.14, 82.84, 88.64, 115.44, 150.57, 114.66, 83.57, 364.67, 849.62, 1821.66, 134.16,
     849.62, 94.02, 851.9, 80.8, 90.44, 70.44, 106.55, 107.4, 97.28, 80.5, 106.96,

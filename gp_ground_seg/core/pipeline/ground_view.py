@@ -51,7 +51,7 @@ ONE_ANGLE = 0.05
 up to which a sensor is at the origin: 0.02 of a Mid-360, 0.1 and more from axles on hills."""
 CLEAR = 0.3
 """Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
-seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
+seen from a sensor upside down, there is less than below it; a field, or one beam, has neither."""
 
 FLOOR_SCATTER = 0.04
 """Distance of the quartiles of the heights of what is on a plane, up to which it is a floor [m]: 0
@@ -69,10 +69,10 @@ LOWEST_SHARE, LEAST_SHARE, MOST_SHARE = 0.06, 0.1, 0.7
 """Least share of the third layer that is in the first: cut clouds mostly have 0.06 to 0.33, uneven
 ground 0 to 0.05. Shares of the third in the second, and of the fourth in the third: cut clouds
 mostly have 0.11 to 0.7, level ground up to 0.04 or from 0.75 on."""
-MOST_FLAT = 0.7
+FEW_FLAT, MOST_FLAT = 0.36, 0.7
 """Share of the cells on the plane, of those with several returns, that are no higher than the
-third layer, from which it is ground: roads with a gutter have 0.96, cut clouds 0 to 0.65, but
-hedges cut where the lowest of few beams end on them."""
+third layer, from which it may be ground that scatters, and is ground: roads with a gutter have
+0.96, cut clouds 0 to 0.65, but hedges cut where the lowest of few beams end on them."""
 LOWER_ENDS = (
     'the lowest returns are the lower ends of objects: the ground is not seen, or was cut away '
     'before, by a crop box or a pass-through filter'
@@ -128,10 +128,11 @@ class View(NamedTuple):
     def is_surface(self) -> bool:
         """Whether it is ground for sure: seen at several angles, or several rows deep."""
         plane = self.plane
-        is_wide = plane.support >= MIN_SUPPORT and plane.coverage >= MIN_COVERAGE
+        has_none_below = plane.n_support >= FEW_CELLS and plane.undercut < UNDERCUT
+        is_wide = has_none_below or plane.support >= MIN_SUPPORT
         is_spread = plane.height >= MIN_CLEARANCE and plane.spread >= MIN_SPREAD
         depth = plane.n_support / (plane.coverage * N_SECTORS)
-        return is_spread or (is_wide and depth >= MIN_DEPTH)
+        return is_spread or (is_wide and plane.coverage >= MIN_COVERAGE and depth >= MIN_DEPTH)
 
     @property
     def is_whole(self) -> bool:
@@ -160,7 +161,8 @@ def is_ceiling(plane: GroundPlane, scan: Scan) -> bool:
     if plane.height >= MIN_CLEARANCE:
         return False
     height = plane.below(*scan.xyz[scan.grid.r < FARTHEST].T.astype(np.float64))
-    return bool(np.count_nonzero(height > CLEAR) <= np.count_nonzero(height < -CLEAR))
+    more = np.count_nonzero(height > CLEAR) - np.count_nonzero(height < -CLEAR)
+    return bool(more < 0 or (more == 0 and not View(plane, UPRIGHT).is_surface))
 
 
 def is_below_sensor(plane: GroundPlane, scan: Scan) -> bool:
@@ -230,11 +232,10 @@ def _shows_lower_ends(view: View, scan: Scan) -> bool:
     height = plane.below(c.x, c.y, c.z)
     is_on = np.abs(height) < np.where(c.r < CUT_REACH, tolerance_at(c.r), 0.0)
     extent = scan.extent[c.segment[is_on] * scan.grid.n_bins + c.bin[is_on]]
-    n_flat = np.count_nonzero((extent > 0.0) & (extent <= LAYERS[2]))
-    if n_flat >= MOST_FLAT * np.count_nonzero(extent):
-        return False
+    n, n_flat = map(np.count_nonzero, (extent, (extent > 0.0) & (extent <= LAYERS[2])))
     is_floor = view.is_surface or np.ptp(np.quantile(height[is_on], (0.25, 0.75))) <= FLOOR_SCATTER
-    return bool(not is_floor or (can_be_cut and _is_cut(scan)))
+    is_cut = n_flat < MOST_FLAT * n and can_be_cut and _is_cut(scan)
+    return bool(is_cut or (not is_floor and n_flat < FEW_FLAT * n))
 
 
 def _is_cut(scan: Scan) -> bool:

@@ -213,7 +213,6 @@ def _doubts(view: View) -> tuple[str, ...]:
     """Say why the height of the plane of `view` may not be that of the ground."""
     plane = view.plane
     is_low = plane.near_height * plane.normal[2] < LOW and plane.is_below_sensor
-    # A boolean of numpy does not multiply a tuple.
     return (LOW_GROUND,) * bool(is_low) + (LITTLE_GROUND,) * (not view.is_whole)
 
 
