@@ -162,7 +162,9 @@ def is_ceiling(plane: GroundPlane, scan: Scan) -> bool:
         return False
     height = plane.below(*scan.xyz[scan.grid.r < FARTHEST].T.astype(np.float64))
     more = np.count_nonzero(height > CLEAR) - np.count_nonzero(height < -CLEAR)
-    return bool(more < 0 or (more == 0 and not View(plane, UPRIGHT).is_surface))
+    # An empty field is seen from about its height, upside down from far above it.
+    is_field = plane.height > -2.0 * LOW and View(plane, UPRIGHT).is_surface
+    return more < 0 or (more == 0 and not is_field)
 
 
 def is_below_sensor(plane: GroundPlane, scan: Scan) -> bool:

@@ -164,7 +164,7 @@ def estimate_pose(
         contradictions = (refusal(elsewhere, given.rotation),)
         if AUTO in (sensor.roll, sensor.pitch):
             raise PointCloudError(*contradictions)
-    doubts = (objection,) if objection and sensor.height == AUTO else ()
+    doubts: tuple[str, ...] = (objection,) if objection and sensor.height == AUTO else ()
     if view is None:
         return dataclasses.replace(given, contradictions=contradictions, doubts=doubts)
     plane, tells_height = view.plane, view.tells_height
@@ -179,6 +179,9 @@ def estimate_pose(
     other = height + plane.other_height - plane.near_height
     measured = MeasuredPose(height, *angles_of(up), tells_height, view.tells_tilt, plane, other)
     estimates_height = sensor.height == AUTO and tells_height
+    if estimates_height:
+        is_low = plane.near_height * plane.normal[2] < LOW and plane.is_below_sensor
+        doubts += (LOW_GROUND,) * bool(is_low) + (LITTLE_GROUND,) * (not view.is_whole)
     return dataclasses.replace(
         pose,
         height=height if estimates_height else given.height,
@@ -186,7 +189,7 @@ def estimate_pose(
         measured=measured,
         contradictions=contradictions or _contradictions(sensor, measured, view),
         is_height_default=sensor.height == AUTO and not tells_height,
-        doubts=doubts + (_doubts(view) if estimates_height else ()),
+        doubts=doubts,
     )
 
 
@@ -207,13 +210,6 @@ def with_fallback(pose: SensorPose, fallback: SensorPose, sensor: SensorConfig) 
         is_height_default=False,
         is_fallback=True,
     )
-
-
-def _doubts(view: View) -> tuple[str, ...]:
-    """Say why the height of the plane of `view` may not be that of the ground."""
-    plane = view.plane
-    is_low = plane.near_height * plane.normal[2] < LOW and plane.is_below_sensor
-    return (LOW_GROUND,) * bool(is_low) + (LITTLE_GROUND,) * (not view.is_whole)
 
 
 def _levelled(given: SensorPose, up: FloatArray, sensor: SensorConfig) -> SensorPose:
