@@ -65,7 +65,7 @@ def test_numpy_asked_for_meanwhile_stays_and_the_newest_parameters_hold(held_bac
         assert backend_after_a_cloud(b, 1) == 'numpy'
         assert not b.node._diagnostics.processing.loader.is_done
         assert not b.set('runtime.backend', 'numpy')
-        assert b.node._diagnostics.processing.loader.is_done
+        assert b.node._diagnostics.processing.loader is None
         held_back.set()
         ros.wait_for(lambda: b.node._is_compiled, 'compiled code')
         assert backend_after_a_cloud(b, 2) == 'numpy'
