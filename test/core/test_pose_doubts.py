@@ -23,13 +23,7 @@ from gp_ground_seg import Config
 from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.pipeline import sensor_pose
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.core.pipeline.ground_view import (
-    LOWER_ENDS,
-    OTHER_AXES,
-    UPRIGHT,
-    View,
-    clearest,
-)
+from gp_ground_seg.core.pipeline.ground_view import LOWER_ENDS, OTHER_AXES, UPRIGHT, View, clearest
 from gp_ground_seg.core.pipeline.sensor_pose import LITTLE_GROUND, LOW_GROUND, NO_HEIGHT
 from gp_ground_seg.lab import simulation
 from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, VLP_16, Scene, objects
@@ -68,9 +62,8 @@ def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicl
         assert sensor_pose.for_sensor(tiny, pose) == tiny
     # The sensor is where the origin is given to be.
     points = moved(scan_of('kerb', SMALL_VLP, 0.15).points, 0.15)
-    assert sensor_pose.sensor_height_of(pose_of(points, origin_z=0.15)) == pytest.approx(
-        0.15, abs=0.04
-    )
+    pose = pose_of(points, origin_z=0.15)
+    assert sensor_pose.sensor_height_of(pose) == pytest.approx(0.15, abs=0.04)
     assert sensor_pose.sensor_height_of(pose_of(points)) == reference
 
 
@@ -90,7 +83,7 @@ def test_a_sensor_just_over_table_tops_warns(over, caplog):
     own = segmenter()
     pose, _ = (own.segment(points).pose for _ in range(2))
     assert pose.height == pytest.approx(over, abs=0.04)
-    assert pose.warnings == (LOW_GROUND,)
+    assert pose.warnings == (LOW_GROUND,) and not pose.is_well_seen
     assert [record.getMessage() for record in caplog.records].count(LOW_GROUND) == 1
     # What is given is not doubted.
     assert segmenter(height=pose.height).segment(points).pose.warnings == ()
@@ -121,7 +114,7 @@ def test_a_part_of_a_scan_shows_little_ground_and_the_whole_enough(scene, sensor
     for width in (10.0, 30.0, 60.0):
         for start in (-180.0, -60.0, 60.0):
             pose = pose_of(part_of(points, start, width))
-            assert pose.warnings in ((NO_HEIGHT,), (LITTLE_GROUND,))
+            assert pose.warnings in ((NO_HEIGHT,), (LITTLE_GROUND,)) and not pose.is_well_seen
 
 
 @pytest.mark.parametrize(
@@ -290,9 +283,15 @@ def test_lower_ends_of_objects_are_no_ground(scene, sensor):
     assert SEGMENTER.segment(made.points).warnings == ()
 
 
-def test_an_even_path_that_falls_to_a_gutter_is_no_cut_cloud():
-    x, y = np.mgrid[-6.0:6.0:0.05, -1.0:1.01:0.05].reshape(2, -1)
-    pose = pose_of(np.stack([x, y, 0.024 * np.abs(x) - 0.4], axis=-1))
+@pytest.mark.parametrize('is_gutter', [False, True])
+def test_a_rough_path_between_hedges_is_no_cut_cloud(is_gutter):
+    """Neither is an even one that falls to a gutter."""
+    x, y = np.meshgrid(np.arange(-6.0, 6.0, 0.05), np.arange(-1.0, 1.01, 0.05))
+    rise = 0.024 * np.abs(x) if is_gutter else 0.05 * np.sin(5.0 * x) * np.cos(4.0 * y)
+    path = np.stack([x, y, rise - 0.4], axis=-1)
+    x, z = np.meshgrid(np.arange(-6.0, 6.0, 0.05), np.arange(-0.4, 0.6, 0.1))
+    hedges = [np.stack([x, 0.0 * x + side, z], -1) for side in (-1.15, 1.15) if not is_gutter]
+    pose = pose_of(np.concatenate([part.reshape(-1, 3) for part in (path, *hedges)]))
     assert pose.height == pytest.approx(0.4, abs=0.05) and pose.warnings == ()
 
 

@@ -123,12 +123,8 @@ def moved(points, lift):
 
 @pytest.mark.parametrize(
     ('scene', 'sensor'),
-    [
-        ('kerb', SMALL_HDL),
-        ('rough', SMALL_HDL),
-        ('urban', SMALL_VLP),
-        ('lying_persons', SMALL_VLP),
-    ],
+    [(s, SMALL_HDL) for s in ('kerb', 'rough')]
+    + [(s, SMALL_VLP) for s in ('urban', 'lying_persons')],
 )
 @pytest.mark.parametrize('height', [0.4, 1.73])
 def test_the_origin_may_be_at_any_height(scene, sensor, height):

@@ -236,6 +236,8 @@ def test_a_vehicle_that_leans_sees_a_slope_as_level_ground(heading):
     normal /= np.linalg.norm(normal)
     np.testing.assert_allclose(made.position, [0.0, 0.0, 2.0] + 1.73 * normal, atol=1e-12)
     np.testing.assert_allclose(made.rotation[:, 2], normal, atol=1e-12)
+    np.testing.assert_allclose(made.rotation @ made.rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(made.rotation) == pytest.approx(1.0)
     assert made.rotation[0, 0] > 0.9 and made.rotation[1, 0] == 0.0  # it drives along x
     np.testing.assert_allclose(made.ground_z, -1.73, atol=1e-7)
     # What a level sensor sees on level ground, a leaning one sees on the slope.
@@ -262,6 +264,7 @@ def test_returns_of_a_vehicle_on_a_slope_lie_on_it(name):
     above = (z - terrain.height(x + dx, y + dy))[returns]
     ahead, left = ahead[returns], left[returns]
     assert len(above) > 300
+    assert np.abs(ahead).max() <= model.length / 2 + 1e-4
     assert np.abs(left).max() <= model.width / 2 + 1e-4
     assert above.min() >= -1e-4
     # Each return lies in one of the outlines, seen from the side, or on a wheel.
@@ -276,11 +279,23 @@ def test_returns_of_a_vehicle_on_a_slope_lie_on_it(name):
     assert above.max() > 0.95 * max(z for _, corners in model.bodies for _, z in corners)
 
 
-# Numbers of solids and objects, and their heights [m] and slopes [degrees] below, added up.
-MEASURES = dict(zip(SCENES, [
-    80, 88.14, 82.84, 88.64, 115.44, 150.57, 114.66, 83.57, 364.67, 849.62, 1821.66, 134.16,
-    849.62, 94.02, 851.9, 80.8, 90.44, 70.44, 106.55, 107.4, 97.28, 80.5, 106.96,
-], strict=True))  # fmt: skip
+# Solids, objects, heights of the lowest and of the highest object [m], slopes of half of the
+# ground and of the steepest [degrees].
+MEASURES = {
+    'flat': (65, 12, 1.5, 1.5, 0, 0), 'slope': (64, 12, 1.5, 1.5, 4.57, 4.57),
+    'ramp': (61, 12, 1.5, 1.5, 0, 6.84), 'rough': (64, 12, 1.5, 1.5, 2.56, 7.08),
+    'road_then_rubble': (64, 12, 1.5, 1.5, 0, 36.44), 'kerb': (64, 12, 1.5, 1.5, 0, 71.57),
+    'ditch': (61, 12, 1.5, 1.5, 0, 38.66), 'crest': (64, 12, 1.5, 1.5, 0, 4.57),
+    'urban': (255, 33, 1.5, 3.6, 0, 71.57), 'traffic_jam': (661, 112, 1.45, 3.6, 0, 71.57),
+    'car_park': (1554, 263, 1.474, 1.731, 0.73, 0.73),
+    'hidden_climb': (105, 20, 1.45, 1.946, 0, 5.76),
+    'wet_road': (661, 112, 1.45, 3.6, 0, 71.57), 'blind_slope': (64, 12, 1.5, 1.5, 7.51, 7.51),
+    'low_boxes': (40, 40, 0.2, 0.6, 0, 0), 'low_boxes_rough': (40, 40, 0.2, 0.6, 2.56, 7.08),
+    'lying_persons': (35, 35, 0.22, 0.22, 0, 0), 'hills': (52, 12, 0.404, 2.142, 10.16, 29.84),
+    'valley': (60, 16, 0.402, 2.437, 5.28, 23.28), 'bank': (60, 16, 0.434, 1.928, 1.46, 17.46),
+    'on_ramp': (52, 12, 0.426, 1.948, 0.7, 13.43), 'dike': (60, 16, 0.404, 1.7, 1.36, 27.5),
+    'hedge': (843, 1, 1.7, 1.7, 1.17, 3.33),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize('name', SCENES)
@@ -289,5 +304,5 @@ def test_every_scene_has_its_measures(name):
     at = np.random.default_rng(0).uniform(-40.0, 40.0, (2, 4000)).T
     degrees = np.degrees(np.arctan(np.linalg.norm(scene.terrain.gradient(at), axis=1)))
     _, *heights = objects.object_heights(scene.terrain, scene.solids)
-    total = len(scene.solids) + len(heights) + min(heights) + max(heights)
-    assert total + np.median(degrees) + degrees.max() == pytest.approx(MEASURES[name], abs=0.02)
+    found = len(scene.solids), len(heights), min(heights), max(heights)
+    assert (*found, np.median(degrees), degrees.max()) == pytest.approx(MEASURES[name], abs=0.01)
